@@ -15,11 +15,12 @@ from ..approximation.basis import StaFBasis
 from ..centers import StateFollowingCenters, cross_polytope
 from ..kernels import ExponentialKernel
 from ..lanes import ready, where_rows
-from ..numerics.checks import fail, flag, positive_real
-from ..systems import Clocked, Plant
+from ..numerics.checks import choice, fail, flag, positive_real
+from ..systems import Clocked, Linear, Plant
 from ..systems.bounds import Limit
 from .loop.controller import LQR, Controller, Feedback
 from .loop.simulation import simulate
+from .planning.global_value import GlobalValue
 from .planning.receding_horizon import BoundedPlans, StrainedPlans
 from .planning.shooting import DirectShooting
 from .policies.rollout import ball_directions
@@ -27,6 +28,19 @@ from .policies.sampled_rollout import SampledRollout
 from .problem.cost import Cost
 from .problem.held_linear import HeldLoop, held_stability
 from .problem.sampled import SampledProblem
+from .reach import (
+    Followed,
+    Reach,
+    UnreachableError,
+    arrived,
+    box_of,
+    compared,
+    drawn,
+    follow_base,
+    learned,
+    sample,
+    sampled_problem,
+)
 
 _log = logging.getLogger(__name__)
 _DECAY = 2.0  # time constants of the slowest mode of the LQR in the horizon
@@ -38,11 +52,17 @@ _TIMED, _TIMING = (20, 400), 1e5  # controls that are timed: at least, at most; 
 _SETTLED = 9.2  # time constants for which the loops of a report run: the slowest mode falls to 1e-4
 _TRIES, _PATIENCE = 8, 1.0  # controls, and s, after which a simulator is called slow
 _SHARE = 0.5  # of a period that a control may take without a warning: another half for a slower moment
-_REGULATED = 1e-2  # share of the distance from the set-point that is left
+_DEAR = 4.0  # times the value of the LQR that it may cost within its bounds, to be a base
+_WAYS = ("auto", "local", "global")
+_GOOD = 1.02  # mean cost over the best known, beyond which the log warns
 
 
 class NearOptimal(SampledRollout):
-    """`SampledRollout` of an LQR as `near_optimal` makes it, with a report.
+    """`SampledRollout` of an LQR as `near_optimal` makes it, or its global value, with a report.
+
+    Attributes:
+        reach: which of the two, and how far it led on a sample of the box.
+        memory: the global value; None where the LQR and its rollouts are enough.
 
     Args:
         basis: as in `SampledRollout`, and so are ``plant``, ``steps`` and ``substeps``.
@@ -67,24 +87,36 @@ class NearOptimal(SampledRollout):
         super().__init__(basis, plant, lqr.cost, lqr, lqr.value, lqr.p, **settings)  # type: ignore[arg-type]
         self.lqr, self.radius, self.substeps, self.plan = lqr, radius, substeps, plan
         self._planners: dict[Any, BoundedPlans] = {}  # each has programs, which take seconds
+        self.memory: GlobalValue | None = None
+        self.box = box_of(plant, lqr.cost.dim)
+        self.reach = Reach("local", tuple(self.box.tolist()), None, None, None)
 
     @property
     def planner(self) -> BoundedPlans | None:
         """Planner of the policy as a function of x; None where it does not plan."""
-        return self.plans() if self.plan else None
+        return self.plans() if self.plan and self.memory is None else None
 
     def forward(self, x: Tensor) -> Tensor:
         """u: (..., n) -> (..., m)."""
+        if self.memory is not None:
+            return self.memory(x.double()).to(x)  # type: ignore[no-any-return]
         u, planner = super().forward(x), self.planner
         if planner is None:
             return u
         rows, controls = x.reshape(-1, x.shape[-1]), u.reshape(-1, u.shape[-1])
         return where_rows(planner.strained(rows), planner, rows, controls).view(u.shape)
 
+    def value(self, x: Tensor) -> Tensor:
+        """Return the cost that the chosen control promises: (..., n) -> (...)."""
+        return super().value(x) if self.memory is None else self.memory.value(x)
+
     def controller(self) -> Controller:
         """Return the controller for loops: the policy, and where the LQR, followed from there, would meet a
         bound of the inputs, a plan that is carried as long as this lasts. With ``plan`` a `RecedingHorizon`,
-        which carries its plan all the time, the first one the best of several."""
+        which carries its plan all the time, the first one the best of several. With a global value the
+        policy alone."""
+        if self.memory is not None:
+            return Feedback(self)
         if (planner := self.planner) is not None:
             return planner.loop
         planner = self.plans(_PLANNED)
@@ -117,14 +149,15 @@ class NearOptimal(SampledRollout):
 
         Args:
             states: how many.
-            spread: half the width of their box, in units of the state; the plant's ``spread`` by default.
+            spread: half the width of their box, in units of the state, of angles at most pi; by default that
+                of `Reach.box`: the plant's ``spread``, and all angles.
             optimum: whether to compare with direct shooting, where the plant allows it: that takes the time.
             seed: of the states.
 
         Returns:
             ``dt``, ``base``, ``centers``, ``radius``, ``horizon`` in s, ``substeps``; ``spectral_radius`` and
-            ``largest_period`` of the held linearised loop; ``spread``; ``regulated``, the share of the
-            states that end within 1 % of where they began; ``over_base_median`` and ``over_base_max``, the
+            ``largest_period`` of the held linearised loop; ``reach``, ``local`` or ``global``; ``spread``;
+            ``regulated``, the share of the states that end within 1 % of where they began; ``over_base_median`` and ``over_base_max``, the
             cost over the LQR's in the states that both regulate; ``over_optimum_median`` and
             ``over_optimum_max`` likewise (the optimum is not held: part of it is the price of holding), None
             where it is not known; ``good_spread``, the largest of 1/4, 1/2, 1, 2, 4 times the spread at which
@@ -134,7 +167,7 @@ class NearOptimal(SampledRollout):
             ``controller()`` plans; None without bounds or a plant in torch.
         """
         width = positive_real("report", "spread", self.plant.spread if spread is None else spread)
-        x0 = self._drawn(states, width, seed)
+        x0 = drawn(self.cost, self.box if spread is None else self._box(width), states, seed)
         stability = held_stability(self.control, self.plant, self.period, at=self.cost.target)
         boxes = [self._drawn(states, share * width, seed + 1) for share in _SHARES]
         costs, all_fine = self._run(self.controller(), torch.cat((x0, *boxes)))  # at once: rows are alone
@@ -151,6 +184,7 @@ class NearOptimal(SampledRollout):
             "radius": self.radius,
             "horizon": self.steps * self.period,
             "substeps": self.substeps,
+            "reach": self.reach.way,
             "spectral_radius": stability.spectral_radius,
             "largest_period": stability.largest_period,
             "spread": width,
@@ -164,20 +198,26 @@ class NearOptimal(SampledRollout):
             "strained": None if planner is None else float(planner.strained(x0).double().mean()),
         }
 
+    def _box(self, width: float) -> Tensor:
+        box = torch.full_like(self.box, width)
+        box[list(self.plant.periodic)] = min(width, math.pi)
+        return box
+
     def _drawn(self, states: int, width: float, seed: int) -> Tensor:
-        generator = torch.Generator().manual_seed(seed)
-        away = width * (2 * torch.rand(states, self.cost.dim, dtype=torch.float64, generator=generator) - 1)
-        return away if self.cost.target is None else away + self.cost.target
+        return drawn(self.cost, self._box(width), states, seed)
 
     def _run(self, controller: Controller, x0: Tensor) -> tuple[Tensor, Tensor]:
         """Cost until the slowest mode has decayed, and which rows were regulated."""
-        periods = math.ceil(_SETTLED / _slowest(self.lqr, self.plant) / self.period)
         run = simulate(
-            controller, self.plant, self.cost, x0, dt=self.period, steps=periods, substeps=self.substeps
+            controller, self.plant, self.cost, x0, dt=self.period, steps=self.settles, substeps=self.substeps
         )
-        left = self.cost.deviation(run.state[:, -1]).norm(dim=-1)
-        began = self.cost.deviation(x0).norm(dim=-1)
-        return run.cost, (left <= _REGULATED * began) & ~run.diverged
+        return run.cost, arrived(self.cost, run.state[:, -1], x0) & ~run.diverged
+
+    @property
+    def settles(self) -> int:
+        """Periods after which the slowest mode of the LQR has fallen to 1e-4, or plans have arrived."""
+        periods = math.ceil(_SETTLED / _slowest(self.lqr, self.plant) / self.period)
+        return periods if self.memory is None else max(periods, 2 * self.memory.library.control.shape[1])
 
     def _good(self, fine: Tensor, states: int, width: float, seed: int) -> float:
         """The largest box of `_SHARES` from which all states are regulated, ``fine``, else a smaller one."""
@@ -216,10 +256,22 @@ def near_optimal(
     radius: float = 0.1,
     horizon: float | None = None,
     plan: bool = False,
+    reach: str = "auto",
 ) -> NearOptimal:
-    """A policy for a plant, held for dt, that costs no more than its LQR.
+    """A policy for a plant, held for dt, that costs no more than its LQR, and leads to the set-point from a box.
 
-    The rules: the base is the LQR made for dt; the horizon is two time constants of its slowest mode (three
+    **Reach.** The box is the plant's ``spread`` around the set-point, and of periodic coordinates the whole
+    turn. The LQR is followed within its bounds from 24 states of it and the ends of its axes, in less than
+    half a second. Where it regulates them all (to 1 % of where they began; within bounds for at most four
+    times its value) the policy is the local one below. Else a global value of the box is learnt, as
+    `learn_global_value` does it: of two states in seconds, of four in up to some minutes, of at most six, for
+    a plant in torch with at most two inputs. The policy then follows the cheapest of the optimal trajectories
+    that this memory finds near x. Outside of the box it does the same from the nearest ones, and where none
+    of them is near enough to be followed it is the LQR within its bounds, if that promises less. Where states
+    are left that are not regulated, or cost more than 1.02 of the best trajectories known, or where nobody
+    could look, the log has one warning with the numbers; ``policy.reach`` and ``report()`` keep them.
+
+    **Local.** The rules: the base is the LQR made for dt; the horizon is two time constants of its slowest mode (three
     with plans), 12 to 60 periods, four quarters; 2 m + 1 centers lie along the m inputs, at ``radius``
     from the state and on it, as `SampledRollout` says (with more inputs than states, around the state as many
     as quadratics need); a plant in continuous time is integrated in steps of a fifth of its fastest time
@@ -257,11 +309,15 @@ def near_optimal(
         radius: of the ball of centers, in units of the state: measure states so that 1 is a large one.
         horizon: s; None for the rule above.
         plan: whether to plan where the LQR would meet a bound. Such a policy is exported to C as its
-            ``controller()``, and loops with it are compiled where that is asked for.
+            ``controller()``, and loops with it are compiled where that is asked for. Not with a global value.
+        reach: ``auto`` for the rule above; ``local``: nobody looks how far the LQR leads; ``global``: the
+            global value, also where the LQR would do.
 
     Raises:
-        ValueError: if an argument breaks its rule, or the plant has no LQR; the message says why.
+        ValueError: if an argument breaks its rule, the plant has no LQR, or ``reach`` is ``global`` and there
+            is no global value; the message says why.
     """
+    choice("near_optimal", "reach", reach, _WAYS)
     held = plant.period if dt is None else dt
     period = positive_real("near_optimal", "dt", held)
     if isinstance(plant, Clocked):
@@ -288,7 +344,69 @@ def near_optimal(
     policy = NearOptimal(basis, plant, lqr, steps=steps, substeps=substeps, radius=radius, plan=plan)
     if not plant.traceable:
         _warn_if_slow(policy)
+    if reach != "local":
+        _extend(policy, reach)
     return policy
+
+
+def _extend(policy: NearOptimal, reach: str) -> None:
+    """Look how far the base leads and, where that is not enough, learn a global value."""
+    x0, linear = sample(policy.cost, policy.box), type(policy.plant) is Linear and not policy.bounds.present
+    if linear and reach == "auto":
+        policy.reach = policy.reach._replace(regulated=1.0, base=1.0)
+        return
+    base = follow_base(policy, x0, 2 * policy.settles)
+    share = float(base.regulated.double().mean())
+    dear = policy.bounds.present & (base.cost > _DEAR * policy.lqr.value(x0))
+    if reach == "auto" and (not base.known or bool((base.regulated & ~dear).all())):
+        note = "" if base.known else "the simulation of the LQR was stopped after 0.4 s"
+        known = share if base.known else None
+        policy.reach = policy.reach._replace(regulated=known, base=known, note=note)
+        if not base.known:
+            _log.warning(
+                "near_optimal did not look how far the LQR leads: to follow it from %d states of the box %s "
+                "takes longer than 0.4 s (%.0f %% had arrived by then). `report()` looks.",
+                *(len(x0), _shown(policy.box), 100 * share),
+            )
+        return
+    try:
+        _learn(policy, x0, base)
+    except UnreachableError as error:
+        if reach == "global":
+            raise fail("near_optimal", "reach", f"must be local here: {error}", reach) from error
+        policy.reach = policy.reach._replace(regulated=share, base=share, note=str(error))
+        _log.warning(
+            "near_optimal: the LQR regulates %.0f %% of %d states of the box %s, and its rollouts promise no "
+            "more. There is no global value: %s",
+            *(100 * share, len(x0), _shown(policy.box), error),
+        )
+
+
+def _learn(policy: NearOptimal, x0: Tensor, base: Followed) -> None:
+    """Give a policy the global value of its box, and say how good it is."""
+    share = float(base.regulated.double().mean())
+    problem = sampled_problem(policy.plant, policy.cost, policy.period)
+    _log.info(
+        "near_optimal: the LQR regulates %.0f %% of %d states of the box %s: learning a global value",
+        *(100 * share, len(x0), _shown(policy.box)),
+    )
+    policy.memory = learned(problem, policy.box, policy.settles)
+    found = compared(policy.memory, policy.cost, x0)
+    best = torch.where(base.regulated, torch.minimum(base.cost, found.best), found.best)
+    good = found.regulated
+    over = float(found.cost[good].sum() / best[good].sum()) if bool(good.any()) else math.inf
+    known = float(good.double().mean())
+    policy.reach = Reach("global", policy.reach.box, known, over, share)
+    if known < 1 or over > _GOOD:
+        _log.warning(
+            "near_optimal: its global value regulates %.0f %% of %d states of the box %s (the LQR %.0f %%), "
+            "at %.3g times the best cost known in the mean.",
+            *(100 * known, len(x0), _shown(policy.box), 100 * share, over),
+        )
+
+
+def _shown(box: Tensor) -> str:
+    return "+-(" + ", ".join(f"{width:.3g}" for width in box.tolist()) + ")"
 
 
 def _periods(seconds: float, period: float) -> int:

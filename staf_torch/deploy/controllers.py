@@ -226,6 +226,8 @@ def _policy_of(controller: Controller | nn.Module, weights: Tensor | None) -> nn
         controller = controller.policy  # type: ignore[assignment]
     if isinstance(controller, RolloutPolicy) and foldable(controller):
         return FoldedRollout(controller)
+    if isinstance(controller, NearOptimal) and controller.memory is not None:
+        return RememberedPolicy(controller.memory)
     if isinstance(controller, NearOptimal) and controller.planner is not None:
         rule = "must not plan anew in every state: `export_learning_c` writes its `controller()`"
         raise fail("policy_of", "controller", rule, "a policy that plans where a bound is met")

@@ -51,7 +51,7 @@ def near_optimal(case: RivalPlant) -> Begin:
     """The discrete LQR improved by rollouts, and by a plan as long as a bound is met."""
     if case.path is not None:
         raise UnsuitableError("follows no path")
-    policy = adp.near_optimal(case.plant(), case.cost(), dt=case.dt)
+    policy = adp.near_optimal(case.plant(), case.cost(), dt=case.dt, reach="local")
     return steered(case, policy.controller())
 
 
@@ -59,7 +59,7 @@ def planned(case: RivalPlant) -> Begin:
     """`near_optimal` with a plan that it carries, where bounds bite."""
     if case.path is not None:
         raise UnsuitableError("follows no path")
-    policy = adp.near_optimal(case.plant(), case.cost(), dt=case.dt, plan=True)
+    policy = adp.near_optimal(case.plant(), case.cost(), dt=case.dt, plan=True, reach="local")
     return steered(case, policy.controller())
 
 

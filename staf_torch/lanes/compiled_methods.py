@@ -221,8 +221,10 @@ def ready(module: nn.Module, x: Tensor) -> bool:
         method.hasten()
     with torch.no_grad():
         module(x)
-    called = [method for method in methods if not method.waits]
-    return bool(called) and all(method.compiled for method in called)
+    served = [method.compiled for method in methods if not method.waits]
+    for part in module.modules():
+        served += [value.compiled for value in vars(part).values() if isinstance(value, Program)]
+    return bool(served) and all(served)
 
 
 def methods_of(owner: Any) -> list[CompiledMethod]:

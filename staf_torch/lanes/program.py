@@ -81,6 +81,11 @@ class Program(Derived):
     def __setstate__(self, state: dict[str, Any]) -> None:
         Program.__init__(self, **state)
 
+    @property
+    def compiled(self) -> bool:
+        """Return whether compiled code serves all kinds of input that came so far, one at least."""
+        return bool(self._compiled) and all(built is not None for built in self._compiled.values())
+
     def described(self, by: bytes | None, tensors: Sequence[Tensor]) -> None:
         """Let traces go through the user's cache; whoever describes a step looks for changes himself.
 

@@ -86,7 +86,7 @@ def test_improved_policy_is_never_worse_than_its_base(
 @torch.no_grad()
 def test_where_a_bound_holds_the_base_at_the_end_its_own_control_is_kept() -> None:
     cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, low=-2.0, high=2.0)
-    policy = adp.near_optimal(systems.Pendulum(), cost, dt=0.05, horizon=0.3)
+    policy = adp.near_optimal(systems.Pendulum(), cost, dt=0.05, horizon=0.3, reach="local")
     lost = torch.tensor([[1.2, 1.0], [0.01, 0.0]], dtype=torch.float64)  # it falls; it stands
     promise = policy.rollout(lost)
     assert promise.free.tolist() == [False, True]
@@ -112,9 +112,10 @@ def test_report_says_what_was_chosen_and_how_good_it_is(two_states: NearOptimal)
 @torch.no_grad()
 def test_exported_policy_is_the_policy(tmp_path: Path) -> None:
     cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, low=-2.0, high=1.5)
+    given: dict[str, Any] = {"dt": 0.05, "horizon": 0.4, "reach": "local"}
     with pytest.raises(ValueError, match=r"`policy_of\(controller=...\)` must not plan anew in every state"):
-        deploy.policy_of(adp.near_optimal(systems.Pendulum(), cost, dt=0.05, horizon=0.4, plan=True))
-    policy = deploy.policy_of(adp.near_optimal(systems.Pendulum(), cost, dt=0.05, horizon=0.4))
+        deploy.policy_of(adp.near_optimal(systems.Pendulum(), cost, **given, plan=True))
+    policy = deploy.policy_of(adp.near_optimal(systems.Pendulum(), cost, **given))
     x = drawn(2, 0.5, 40)
     deploy.export_c(policy, x[:1], tmp_path / "staf.h", ["u"])
     (u,) = runner_c(tmp_path / "staf.h", [1], torch.float64)(x)
@@ -216,7 +217,9 @@ class Gap(systems.ControlAffineSystem):
 
 
 def test_report_finds_the_region_of_a_plant_in_small_units() -> None:
-    policy = adp.near_optimal(Gap(), adp.QuadraticCost(25.0, 1.0, dim=1, inputs=1), dt=0.05, horizon=0.2)
+    policy = adp.near_optimal(
+        Gap(), adp.QuadraticCost(25.0, 1.0, dim=1, inputs=1), dt=0.05, horizon=0.2, reach="local"
+    )
     report = policy.report(states=2, optimum=False)
     assert report["regulated"] == 0  # in the box of 1
     assert 1 / 256 <= report["good_spread"] <= 1 / 32

@@ -132,7 +132,7 @@ def test_feedback_of_a_plant_with_bounds_in_c(kind: str, tmp_path: Path) -> None
             plant, cost, lambda x: 0.5 * x[..., 1] ** 2 + 9.81 * x[..., 0].cos(), gain=0.1, capture=1.0
         )
         if kind == "energy"
-        else adp.near_optimal(plant, cost, dt=0.05, horizon=0.2)
+        else adp.near_optimal(plant, cost, dt=0.05, horizon=0.2, reach="local")
     )
     x, path = 0.2 * states(30), tmp_path / "policy.h"
     module = deploy.policy_of(policy)

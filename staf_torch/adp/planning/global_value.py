@@ -123,7 +123,7 @@ class GlobalValue(nn.Module):
 
         n, h = self.problem.dim, self.lookahead
         images = self.images()
-        self._rows = self.entries.repeat(len(images) // len(self.entries)).numpy()
+        self._rows = self.entries.repeat(len(images) // len(self.entries))
         self._tree = cKDTree(images.numpy())
         self._windows = self.plans.unfold(0, h, 1).mT  # (N length - h + 1, h, w), a view
         # Where every trajectory rests at the goal, under the linear feedback.
@@ -131,7 +131,7 @@ class GlobalValue(nn.Module):
         self.worst = float(self.models[self.entries, n].max())
 
     def __getstate__(self) -> dict[str, Any]:
-        dropped = dict.fromkeys(("_tree", "_windows"))
+        dropped = dict.fromkeys(("_tree", "_windows", "_rows"))
         return {**vars(self), **dropped}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -149,9 +149,10 @@ class GlobalValue(nn.Module):
         return u if x.dim() == 2 else u.reshape(*x.shape[:-1], u.shape[-1])
 
     def value(self, x: Tensor) -> Tensor:
-        """V(x): (..., n) -> (...)."""
+        """V(x), inf where no plan covers x: (..., n) -> (...)."""
         trailing("GlobalValue.value", "x", x, 1, self.problem.dim)
-        return self.choose(x.reshape(-1, x.shape[-1])).value.reshape(x.shape[:-1])
+        found = self.choose(x.reshape(-1, x.shape[-1]))
+        return torch.where(found.covered, found.value, torch.inf).reshape(x.shape[:-1])
 
     def gradient(self, x: Tensor) -> Tensor:
         """g_j + H_j d of the model that the best candidate starts at: (..., n) -> (..., n)."""
@@ -198,7 +199,7 @@ class GlobalValue(nn.Module):
         """Rows of the memory nearest to x (B, n), and last the resting one: (B, K + 1) int64."""
         count = self.candidates if without is None else min(4 * self.candidates, len(self._rows))
         at = self._tree.query(self.seen(x).numpy(), count)[1].reshape(len(x), -1)
-        rows = self._rows[at]
+        rows = self._rows.numpy()[at]
         if without is not None:
             own = rows // self.length == without.numpy()[:, None]
             rows = np.take_along_axis(rows, own.argsort(axis=1, kind="stable"), axis=1)[:, : self.candidates]

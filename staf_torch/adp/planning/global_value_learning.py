@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ...numerics.checks import integer
+from ...numerics.checks import fail, integer, real
 from ..problem.sampled import SampledProblem
 from .ddp import BoxDDP, Reference, Trajectories, chosen, rows_of
 from .global_value import GlobalValue
@@ -40,6 +40,7 @@ def learn_global_value(
     seed: int = 0,
     candidates: int = 48,
     lookahead: int = 60,
+    enough: float = 1.0,
 ) -> GlobalValue:
     """Fill a memory with optimal trajectories until it knows the box goal +- region.
 
@@ -49,7 +50,9 @@ def learn_global_value(
     3. Rounds: at fresh states the memory's own cost is compared with what such a sweep finds, and where the
        optimum is more than 1 % lower the trajectory joins the library. Then another sweep.
 
-    Every round says in the log what share of the fresh states was known to 1 %.
+    Every round says in the log what share of the fresh states was known to 1 %. At the end the log warns with
+    the share of trajectories that do not arrive at the goal within ``steps``: the memory leaves them out, and
+    where no other covers the states that they begin from, ``value`` is inf there.
 
     Example:
         >>> def step(x, u):  # a cart without friction, for 0.1 s
@@ -71,10 +74,13 @@ def learn_global_value(
         states: of a round.
         seed: of the states and the random controls.
         candidates: as in `GlobalValue`, and so is ``lookahead``.
+        enough: share of fresh states known to 1 % at which no further round begins, in (0, 1].
 
     Raises:
         ValueError: if an argument breaks its rule, or no trajectory arrives at the goal.
     """
+    if not 0 < real("learn_global_value", "enough", enough) <= 1:
+        raise fail("learn_global_value", "enough", "must be in (0, 1]", enough)
     integer("learn_global_value", "trajectories", trajectories, least=2)
     integer("learn_global_value", "rounds", rounds, least=0)
     integer("learn_global_value", "states", states, least=1)
@@ -100,7 +106,17 @@ def learn_global_value(
         _log.info("round %d: %.1f %% of %d fresh states known to 1 %%", round_ + 1, 100 * share, states)
         both = (torch.cat((old, new[better])) for old, new in zip(library, found, strict=True))
         library = swept(memory(Trajectories(*both)), search)
-    return memory(library)
+        if share >= enough:
+            break
+    known = memory(library)
+    late = int((~known.arrives).sum())
+    if late:
+        _log.warning(
+            "learn_global_value: %d of %d trajectories do not arrive at the goal within %d steps and are "
+            "left out. Give more `steps`, or a smaller `region` if the bounds allow no more.",
+            *(late, len(known.arrives), steps),
+        )
+    return known
 
 
 def swept(memory: GlobalValue, search: BoxDDP) -> Trajectories:

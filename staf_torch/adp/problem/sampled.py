@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -135,23 +136,13 @@ class SampledProblem(nn.Module):
         cost = cost.bounded(low, high).around(plant)
         if cost.discount:
             raise fail("SampledProblem.of", "cost", "must have no discount", cost.discount)
-        if plant.period is None:
-            h = positive_real("SampledProblem.of", "dt", dt)
-        elif dt is not None and dt != plant.period:
+        h = positive_real("SampledProblem.of", "dt", dt) if plant.period is None else plant.period
+        if plant.period is not None and dt is not None and dt != plant.period:
             raise fail("SampledProblem.of", "dt", f"must be the plant's period, {plant.period} s", dt)
-
-        def held(x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-            states, slopes = runge_kutta_stages(lambda at, share: plant.motion(at, u), x, h)
-            paid = runge_kutta_mean([cost.rate(at, u) for at in states], h)
-            return x + runge_kutta_mean(slopes, h), paid
-
-        def stepped(x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-            assert plant.period is not None
-            return x + plant.motion(x, u), plant.period * cost.rate(x, u)
 
         box = cost.bounds
         return cls(
-            held if plant.period is None else stepped,
+            partial(_held, plant, cost, h) if plant.period is None else partial(_stepped, plant, cost),
             dim=cost.dim,
             inputs=cost.inputs,
             low=None if box is None else box.low,
@@ -264,6 +255,19 @@ class SampledProblem(nn.Module):
             ) from error
         clock = self.dim - n
         return pad(p, (0, clock, 0, clock)), pad(k, (0, clock))
+
+
+def _held(plant: Plant, cost: Cost, h: float, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+    """Step of a plant in continuous time, and its cost."""
+    states, slopes = runge_kutta_stages(lambda at, share: plant.motion(at, u), x, h)
+    paid = runge_kutta_mean([cost.rate(at, u) for at in states], h)
+    return x + runge_kutta_mean(slopes, h), paid
+
+
+def _stepped(plant: Plant, cost: Cost, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+    """Step of a plant in discrete time, and its cost."""
+    assert plant.period is not None
+    return x + plant.motion(x, u), plant.period * cost.rate(x, u)
 
 
 class Derivatives(NamedTuple):

@@ -143,7 +143,7 @@ def test_a_loop_carries_on_the_plans_of_the_rows_that_need_one() -> None:
     """Near a bound a plan is carried; else the policy has the control, bit for bit. Rows are alone."""
     plant = systems.Linear([[0.0, 1.0], [1.0, 0.0]], [[0.0], [1.0]])
     cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, low=-1.0, high=1.0)
-    policy = adp.near_optimal(plant, cost, dt=0.1)
+    policy = adp.near_optimal(plant, cost, dt=0.1, reach="local")
     loop, x = policy.controller(), tensor([[0.6, 0.1], [0.05, 0.0], [math.nan, 0.0]])
     assert loop.label == adp.Feedback(policy).label
     carried = loop.init(x)

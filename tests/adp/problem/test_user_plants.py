@@ -190,7 +190,7 @@ def test_share_of_the_period_that_a_control_takes_is_said_from_a_half_on(
     now = iter(range(1000))
     monkeypatch.setattr(time, "perf_counter", lambda: seconds * next(now))
     with caplog.at_level(logging.WARNING):
-        adp.near_optimal(pendulum(turn, dt=0.1), COST, horizon=0.4)
+        adp.near_optimal(pendulum(turn, dt=0.1), COST, horizon=0.4, reach="local")
     share = f"{100 * seconds / 0.1:.0f} % of the 0.1 s for which it is held: a slower moment and it is late"
     assert (share in caplog.text) == said
     assert bool(caplog.text) == said

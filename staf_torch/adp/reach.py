@@ -1,0 +1,169 @@
+"""How far a held feedback leads, on a sample of the box around the goal, and a value for all of that box."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..systems import Plant
+from .planning.ddp import BoxDDP
+from .planning.global_value import GlobalValue
+from .planning.global_value_learning import best_from, learn_global_value
+from .planning.receding_horizon import best_held
+from .policies.sampled_rollout import SampledRollout
+from .problem.cost import Cost
+from .problem.sampled import SampledProblem
+
+_log = logging.getLogger(__name__)
+STATES = 24  # drawn from a box, beside the 2 n ends of its axes
+REGULATED = 1e-2  # share of the distance from the set-point that is left
+_LOOK = 16  # periods after which it is looked who arrived
+_BUDGET = 0.4  # s that following the base may take
+_DIMS, _INPUTS = 6, 2  # at most, of a plant whose global value is learnt
+_STEPS = (60, 480)  # periods of a trajectory of the global value, at least and at most
+_SEED = 7
+
+
+class Reach(NamedTuple):
+    """How far a policy leads from the states of a box around its set-point."""
+
+    way: str  # ``local``: the LQR and its rollouts; ``global``: a memory of optimal trajectories
+    box: tuple[float, ...]  # half widths, in units of the state
+    regulated: float | None  # share of a sample that ends within 1 % of where it began; None: nobody looked
+    over_best: float | None  # mean cost over that of the best trajectories known, of the regulated
+    base: float | None  # share that the LQR within its bounds regulates
+    note: str = ""  # why nobody looked, or why there is no global value
+
+
+def box_of(plant: Plant, dim: int) -> Tensor:
+    """Half the width of a plant's box: its ``spread``, and of its angles all of them: (n,)."""
+    width = torch.full((dim,), float(plant.spread), dtype=torch.float64)
+    width[list(plant.periodic)] = math.pi
+    return width
+
+
+def drawn(cost: Cost, width: Tensor, count: int, seed: int) -> Tensor:
+    """States drawn uniformly from the box of half widths (n,) around the set-point, (count, n)."""
+    generator = torch.Generator().manual_seed(seed)
+    away = width * (2 * torch.rand(count, cost.dim, dtype=torch.float64, generator=generator) - 1)
+    return away if cost.target is None else away + cost.target
+
+
+def sample(cost: Cost, width: Tensor) -> Tensor:
+    """States of a box: the ends of its axes, and some drawn."""
+    ends = torch.cat((torch.diag(width), -torch.diag(width)))
+    return torch.cat((ends if cost.target is None else ends + cost.target, drawn(cost, width, STATES, _SEED)))
+
+
+def arrived(cost: Cost, x: Tensor, x0: Tensor) -> Tensor:
+    """Whether states (B, n) are within 1 % of where they began, (B,) bool."""
+    left, began = cost.deviation(x).norm(dim=-1), cost.deviation(x0).norm(dim=-1)
+    return torch.isfinite(left) & (left <= REGULATED * began)
+
+
+class Followed(NamedTuple):
+    """Where a base leads."""
+
+    regulated: Tensor  # (B,) bool
+    cost: Tensor  # (B,), until all had arrived
+    known: bool  # False where the time was over before all rows had arrived, diverged or had their time
+
+
+@torch.no_grad()
+def follow_base(policy: SampledRollout, x0: Tensor, periods: int) -> Followed:
+    """Follow the base of a policy, within its bounds, from x0 (B, n), for 0.4 s of computing at most."""
+    x, paid, began = x0, torch.zeros_like(x0[:, 0]), time.perf_counter()
+    good, known = torch.zeros_like(paid, dtype=torch.bool), False
+    for k in range(1, periods + 1):
+        x, spent = policy.holding(x, policy.bounds.clip(policy.base(x)))
+        x, paid = torch.where(torch.isfinite(x).all(-1, keepdim=True), x, torch.nan), paid + spent
+        late = time.perf_counter() - began > _BUDGET
+        if k % _LOOK == 0 or k == periods or late:
+            good = arrived(policy.cost, x, x0)
+            known = k == periods or bool((good | x.isnan().any(-1)).all())
+            if known or late:  # saves time: nothing more will change, or there is none
+                break
+    return Followed(good, paid, known)
+
+
+class UnreachableError(ValueError):
+    """Why a plant has no global value."""
+
+
+def sampled_problem(plant: Plant, cost: Cost, period: float) -> SampledProblem:
+    """The plant and its cost in steps, as a global value needs them.
+
+    Raises:
+        UnreachableError: that says why there is none.
+    """
+    if not plant.traceable:
+        raise UnreachableError("a global value needs a plant that is torch all through")
+    if cost.dim > _DIMS or cost.inputs > _INPUTS:
+        raise UnreachableError(f"a global value is learnt of at most {_DIMS} states and {_INPUTS} inputs")
+    try:
+        return SampledProblem.of(plant, cost, dt=period)
+    except ValueError as error:
+        raise UnreachableError(str(error)) from error
+
+
+def learned(problem: SampledProblem, width: Tensor, steps: int) -> GlobalValue:
+    """The global value of a box by the sizes that two states need, and four, in seconds to a minute.
+
+    Args:
+        problem: plant, cost and bounds in steps.
+        width: half the width of the box, (n,).
+        steps: of a trajectory, to begin with: twice as many where fewer than nine of ten arrive.
+
+    Raises:
+        UnreachableError: if no trajectory arrives.
+    """
+    large = problem.dim > 2
+    sizes = {"trajectories": 120, "rounds": 4, "states": 100} if large else {"trajectories": 80, "rounds": 3}
+    ahead = {"candidates": 48, "lookahead": 60} if large else {"candidates": 24, "lookahead": 40}
+    try:
+        count = _enough_steps(problem, width, min(max(steps, _STEPS[0]), _STEPS[1] // 2))
+        more = {"states": 100, **sizes, **ahead, "seed": _SEED}
+        return learn_global_value(problem, width, steps=count, enough=0.97, **more)  # type: ignore[arg-type]
+    except ValueError as error:
+        raise UnreachableError(str(error)) from error
+
+
+def _enough_steps(problem: SampledProblem, width: Tensor, steps: int) -> int:
+    """Steps in which nine of ten plans arrive at the goal; else the most."""
+    generator = torch.Generator().manual_seed(_SEED)
+    uniform = torch.rand(STATES, problem.dim, dtype=torch.float64, generator=generator)
+    x0 = problem.goal + width * (2 * uniform - 1)
+    while steps < _STEPS[1]:
+        found = best_held(BoxDDP(problem, steps=steps, iterations=40, tolerance=1e-5), x0)
+        late = found.value[:, -1] > REGULATED * found.cost
+        if float(late.double().mean()) <= 0.1:
+            break
+        steps = min(2 * steps, _STEPS[1])
+    return steps
+
+
+class Compared(NamedTuple):
+    """A policy beside the best trajectories that are known."""
+
+    regulated: Tensor  # (B,) bool
+    cost: Tensor  # (B,)
+    best: Tensor  # (B,)
+
+
+@torch.no_grad()
+def compared(memory: GlobalValue, cost: Cost, x0: Tensor) -> Compared:
+    """What following a memory costs from x0 (B, n), and the best that is found from its plans."""
+    problem, steps = memory.problem, memory.length - memory.lookahead - 1
+    search = BoxDDP(problem, steps=steps, iterations=40, tolerance=1e-5)
+    best = best_from(memory, search, x0).cost
+    x, paid = x0, torch.zeros_like(x0[:, 0])
+    for _ in range(2 * steps):
+        x, spent = problem.advance(x, memory.choose(x).control)
+        paid = paid + spent
+    good = arrived(cost, x, x0)
+    return Compared(good, paid + problem.terminal(x), best)
