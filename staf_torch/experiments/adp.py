@@ -267,6 +267,9 @@ def _drawn(solution: LoopSolution) -> AdpHistory:
     errors = {"control_error": optimum.control_error, "value_error": optimum.value_error}
     first: dict[str, Any] = {name: rows[0].cpu().numpy() for name, rows in recorded(result).items()}
     first |= {name: None if rows is None else rows[0].cpu().numpy() for name, rows in errors.items()}
-    first["state"] = wrap(result.state[0], solution.periodic).cpu().numpy()
+    state = wrap(result.state[0], solution.periodic).cpu()
+    for k in solution.periodic:  # no line where an angle jumps by a turn
+        state[1:, k][state[:, k].diff().abs() > math.pi] = torch.nan
+    first["state"] = state.numpy()
     best = None if optimum.cost is None else float(optimum.cost[0])
     return AdpHistory(time=result.time.numpy(), optimal_cost=best, **first)

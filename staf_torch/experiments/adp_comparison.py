@@ -12,7 +12,7 @@ import torch
 from omegaconf import DictConfig, open_dict
 from torch import Tensor
 
-from ..adp import Controller, Feedback, RolloutPolicy
+from ..adp import Controller, Feedback, LoopResult, RolloutPolicy
 from ..adp.loop.setup import AdpProblem
 from ..adp.planning.shooting.reference_optimum import optimal_cost
 from ..figures.closed_loop import draw_comparison
@@ -76,9 +76,10 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
         seconds = (time.perf_counter() - start) / (problem.steps * len(problem.initial_states))
         ratio = torch.where(result.diverged, torch.inf, result.cost / best)
         functions, points = _size(problem.controller)
-        row = {"functions": functions, "points": points} | comparison_row(result, ratio)
+        final = _final(problem, result)
+        row = {"functions": functions, "points": points} | comparison_row(result, ratio, final)
         study.add(f"{label_key(name)}_", row, {"microseconds": 1e6 * seconds}, method=name)
-        ratios[name] = torch.where(regulated(result), ratio, torch.inf).cpu().numpy()
+        ratios[name] = torch.where(regulated(result, final), ratio, torch.inf).cpu().numpy()
     drawing = (lambda: draw_comparison(ratios)) if cfg.figures else None
     return study.write(RunDirectory(directory), drawing, "adp_comparison")
 
@@ -97,6 +98,11 @@ def variant(cfg: DictConfig, changes: dict[str, Any]) -> AdpProblem:
     problem = adp_problem(chosen)
     # The first state is the middle of the box, the equilibrium: nothing can be compared there.
     return problem.with_states(problem.initial_states[1:])
+
+
+def _final(problem: AdpProblem, result: LoopResult) -> Tensor:
+    """The states at the end, measured from the set-point, (B, n)."""
+    return problem.cost.around(problem.system).deviation(result.state[:, -1])
 
 
 def _optimum(problem: AdpProblem) -> Tensor:
@@ -129,7 +135,9 @@ def initial_weights(cfg: DictConfig, directory: Path, progress: Progress = SHOWN
     for name, changes in _LAWS.items():
         problem = _from_weights(variant(cfg, changes), weights, cfg.adp.actor / cfg.adp.critic)
         result = solve(problem, progress)
-        shares = regulated(result).double().reshape(len(weights), -1).mean(-1).tolist()
+        shares = (
+            regulated(result, _final(problem, result)).double().reshape(len(weights), -1).mean(-1).tolist()
+        )
         overall, diverged = sum(shares) / len(shares), float(result.diverged.double().mean())
         metrics |= {f"{name}_regulated_W{w:g}": share for w, share in zip(weights, shares, strict=True)}
         metrics |= {f"{name}_regulated_fraction": overall, f"{name}_diverged_fraction": diverged}

@@ -77,33 +77,34 @@ def _worst(values: Tensor) -> float | None:
     return float(values.max()) if values.numel() else None
 
 
-def regulated(result: LoopResult) -> Tensor:
-    """|x| < 1e-3 at the end and not diverged: (B,) bool."""
-    near: Tensor = result.state[:, -1].norm(dim=-1) < _REGULATED
+def regulated(result: LoopResult, final: Tensor | None = None) -> Tensor:
+    """|e| < 1e-3 at the end and not diverged, ``final`` as in `adp_metrics`: (B,) bool."""
+    near: Tensor = (result.state[:, -1] if final is None else final).norm(dim=-1) < _REGULATED
     return near & ~result.diverged
 
 
-def comparison_row(result: LoopResult, ratio: Tensor) -> dict[str, float | None]:
+def comparison_row(result: LoopResult, ratio: Tensor, final: Tensor | None = None) -> dict[str, float | None]:
     """A method over many initial states, as a row of a table.
 
     Args:
         result: the closed loops.
         ratio: cost / V*(x(0)), (B,), inf for rows that diverged, NaN where V* was not found.
+        final: as in `adp_metrics`.
 
     Returns:
         ``ratio_median`` over the rows that were regulated, as are ``ratio_mean`` and ``ratio_max``; the
-        fractions ``regulated`` and ``diverged`` of all; ``final_state_norm``, the median |x| at the end.
+        fractions ``regulated`` and ``diverged`` of all; ``final_state_norm``, the median |e| at the end.
     """
-    good = regulated(result)
+    good = regulated(result, final)
     kept = ratio[good & ~ratio.isnan()]
-    final = result.state[:, -1].norm(dim=-1)
+    left = (result.state[:, -1] if final is None else final).norm(dim=-1)
     return {
         "ratio_median": _median(kept),
         "ratio_mean": float(kept.mean()) if len(kept) else None,
         "ratio_max": _worst(kept),
         "regulated": float(good.double().mean()),
         "diverged": float(result.diverged.double().mean()),
-        "final_state_norm": _median(final),
+        "final_state_norm": _median(left),
     }
 
 

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
+
+_PROBES = 4  # states at which an output is asked
+_SAME = 1e-6  # relative, of two changes that are one
 
 
 def wrap(difference: Tensor, periodic: Sequence[int]) -> Tensor:
@@ -28,5 +31,68 @@ def wrap(difference: Tensor, periodic: Sequence[int]) -> Tensor:
     return torch.stack(columns, dim=-1)
 
 
-def _wrapped(angle: Tensor) -> Tensor:
-    return angle - 2 * math.pi * (angle / (2 * math.pi)).round()
+def turned(x: Tensor, near: Tensor, periodic: Sequence[int]) -> Tensor:
+    """x with its periodic coordinates turned by whole turns to within pi of ``near``: (..., n) -> (..., n).
+
+    Where it lies there already, not a bit of it changes.
+    """
+    apart = near - x
+    return x + (apart - wrap(apart, periodic))
+
+
+def unwrapped(x: Tensor, periodic: Sequence[int]) -> Tensor:
+    """States over time, each turned to within pi of the one before: (..., T, n) -> (..., T, n)."""
+    if not periodic:
+        return x
+    moved = x[..., 1:, :] - x[..., :-1, :]
+    turns = (wrap(moved, periodic) - moved).cumsum(-2)
+    return torch.cat((x[..., :1, :], x[..., 1:, :] + turns), dim=-2)
+
+
+def wrap_each(difference: Tensor, periods: Sequence[float]) -> Tensor:
+    """The difference with every entry k in half a period around 0: (..., q) -> (..., q).
+
+    Args:
+        difference: of two outputs.
+        periods: q numbers in the units of the outputs, 0 for one that has none: see `periods_of`.
+    """
+    if not any(periods):
+        return difference
+    entries = zip(difference.unbind(-1), periods, strict=True)
+    return torch.stack([_wrapped(x, period) if period else x for x, period in entries], dim=-1)
+
+
+def periods_of(output: Callable[[Tensor], Tensor], dim: int, periodic: Sequence[int]) -> tuple[float, ...]:
+    """By how much every output changes as a periodic coordinate goes around once: q numbers, 0 where none
+    does by the same amount everywhere. Of two coordinates it is what both are multiples of.
+
+    Args:
+        output: (B, n) -> (B, q), float64.
+        dim: n.
+        periodic: the coordinates that are angles in rad.
+    """
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(_PROBES, dim, dtype=torch.float64, generator=generator)
+    with torch.no_grad():
+        seen = output(x)
+        periods = [0.0] * seen.shape[-1]
+        for index in periodic:
+            around = x.clone()
+            around[:, index] += 2 * math.pi
+            jump = (output(around) - seen).abs()
+            same = (jump - jump[0]).abs() <= _SAME * (1 + seen.abs().amax(0))
+            for k, (turns, size) in enumerate(zip(same.all(0).tolist(), jump[0].tolist(), strict=True)):
+                if turns and size > _SAME:
+                    periods[k] = _common(periods[k], size)
+    return tuple(periods)
+
+
+def _common(one: float, other: float) -> float:
+    """The largest number of which both are multiples, up to rounding."""
+    while one > _SAME * other:
+        one, other = abs(other - one * round(other / one)), one
+    return other
+
+
+def _wrapped(angle: Tensor, period: float = 2 * math.pi) -> Tensor:
+    return angle - period * (angle / period).round()

@@ -55,6 +55,22 @@ def riccati_step(
     return RiccatiStep(qx + along, 0.5 * (bent + bent.mT), promised, change, feedback)
 
 
+def measured(covariance: Tensor, gain: Tensor, row: Tensor, variance: Tensor) -> Tensor:
+    """(I - k h') P (I - k h')' + r k k', the covariance after the measurement h'x with the gain k: positive
+    where P - k h'P, which is the same without rounding, may become 0 for ever or negative (Joseph's form).
+
+    Args:
+        covariance: P, (..., n, n).
+        gain: k, (..., n).
+        row: h, (..., n).
+        variance: r, (...).
+    """
+    seen = (covariance * row.unsqueeze(-2)).sum(-1)
+    left = covariance - gain.unsqueeze(-1) * seen.unsqueeze(-2)
+    back = (left * row.unsqueeze(-2)).sum(-1)
+    return left + (variance.unsqueeze(-1) * gain - back).unsqueeze(-1) * gain.unsqueeze(-2)
+
+
 def product(a: Tensor, b: Tensor) -> Tensor:
     """(..., i, j), (..., j, k) -> (..., i, k), entry by entry."""
     return (a.unsqueeze(-1) * b.unsqueeze(-3)).sum(-2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..numerics.differences import central_slopes
+from ..numerics.differences import Apart, central_slopes
 from .base import Linearisation
 
 Motion = Callable[..., Any]
@@ -83,8 +84,13 @@ class BlackBox:
             states.append(np.asarray(self._function(states[-1], controls[-1]), dtype=np.float64))
         return np.stack(states, axis=1), np.stack(controls, axis=1)
 
-    def linearisation(self, x: Tensor, u: Tensor) -> Linearisation:
+    def linearisation(self, x: Tensor, u: Tensor, apart: Apart = operator.sub) -> Linearisation:
         """d/dx and d/du at one point (n,), (m,).
+
+        Args:
+            x: (n,).
+            u: (m,).
+            apart: the difference of two values, of a step with angles as `Plant.difference`.
 
         Raises:
             ValueError: if the function has a kink there: slopes of two step sizes differ by more than 5 %; or
@@ -100,8 +106,8 @@ class BlackBox:
         if self.torch:
             slopes: Tensor = torch.func.jacrev(lambda z: whole(z.unsqueeze(0))[0])(at).detach()
         else:
-            slopes = central_slopes(whole, at)
-            wider = central_slopes(whole, at, 100 * at.abs().clamp(min=1.0))
+            slopes = central_slopes(whole, at, apart=apart)
+            wider = central_slopes(whole, at, 100 * at.abs().clamp(min=1.0), apart)
             off = (slopes - wider).abs().max() / slopes.abs().max().clamp(min=1e-12)
             if not bool(off <= _KINK):
                 raise ValueError(

@@ -57,7 +57,11 @@ class FunctionPlant(Plant):
 
     def linearisation(self, x: Tensor | None = None, u: Tensor | None = None) -> Linearisation:
         at = self._rest[0] if x is None else x
-        return self.function.linearisation(at, self._rest[1] if u is None else u)
+        return self.function.linearisation(at, self._rest[1] if u is None else u, self._apart)
+
+    def _apart(self, one: Tensor, other: Tensor) -> Tensor:
+        """The difference of two values of the function."""
+        return one - other
 
 
 class StepPlant(FunctionPlant):
@@ -116,6 +120,9 @@ class StepPlant(FunctionPlant):
     def motion(self, x: Tensor, u: Tensor) -> Tensor:
         """x+ - x, angles in [-pi, pi]."""
         return self.difference(self.step(x, u), x)
+
+    def _apart(self, one: Tensor, other: Tensor) -> Tensor:
+        return self.difference(one, other)
 
 
 class RatePlant(FunctionPlant):

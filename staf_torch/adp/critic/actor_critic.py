@@ -121,22 +121,23 @@ class ActorCritic(Controller):
         """The Bellman terms at the state (first) and at the extrapolated points, by ``model`` if given."""
         points = self.points(x, uniform)
         return bellman_terms(
-            self.basis, model or self.model, self.cost, points, self._followed(x, points), actor
+            self.basis, model or self.model, self.cost, points, self._followed(points), actor
         )
 
     def points(self, x: Tensor, uniform: Tensor) -> Tensor:
-        """The state and the extrapolated points, (..., P, n)."""
+        """The state, its angles in [-pi, pi], and the extrapolated points, (..., P, n)."""
+        x = self.cost.deviation(x)
         return torch.cat((x.unsqueeze(-2), self.extrapolation(x, uniform)), dim=-2)
 
     def value_gradient(self, x: Tensor, critic: Tensor, uniform: Tensor) -> Tensor:
         """grad V^ at these points, (..., P, n)."""
         points = self.points(x, uniform)
-        gradient = self.basis.gradient(points, self._followed(x, points))  # (..., P, M, n)
+        gradient = self.basis.gradient(points, self._followed(points))  # (..., P, M, n)
         return (gradient * critic[..., None, :, None]).sum(-2)
 
-    def _followed(self, x: Tensor, points: Tensor) -> Tensor:
+    def _followed(self, points: Tensor) -> Tensor:
         """The states around which the centers of the points stand, (..., P, n)."""
-        return points if self.extrapolation.moving else x.unsqueeze(-2).expand(points.shape)
+        return points if self.extrapolation.moving else points[..., :1, :].expand(points.shape)
 
     def step(self, x: Tensor, carried: Weights, uniform: Tensor, dt: float) -> tuple[Tensor, Weights]:
         terms = self.terms(x, carried.actor, uniform)
@@ -147,7 +148,7 @@ class ActorCritic(Controller):
         return self.law.step(self.law.sums(terms, self.extrapolation.weights, weights), weights, dt)
 
     def value(self, x: Tensor, recorded: Mapping[str, Tensor]) -> Tensor:
-        return self.basis.value(recorded["critic_weights"], x)
+        return self.basis.value(recorded["critic_weights"], self.cost.deviation(x))
 
 
 def _weights(name: str, value: Initial, count: int) -> Tensor:

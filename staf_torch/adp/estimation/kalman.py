@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from ...numerics.angles import periods_of, wrap_each
 from ...numerics.checks import fail, non_negative, one_or_each, positive, real, vector
 from ...numerics.linalg import row_jacobian
-from ...numerics.riccati import product
+from ...numerics.riccati import measured, product
 from ...systems import Plant, runge_kutta_step
 from ..loop.controller import Carried, Controller
 from ..problem.cost import Output, matvec
@@ -23,10 +25,14 @@ class Belief(NamedTuple):
     mean: Tensor  # (..., n)
     covariance: Tensor  # (..., n, n)
     u: Tensor  # (..., m) held since the last measurement
+    missed: Tensor | None = None  # (..., q) measurements of every output that were missing, where counted
 
 
 class KalmanFilter(abc.ABC):
     """The state from outputs y = h(x) + noise, with the model of the plant between measurements.
+
+    An entry of y that is NaN is missing: the other outputs are used, without any the model alone goes on, and
+    ``missed`` of the belief counts it. Of outputs that are angles y - h(x^) is in [-pi, pi].
 
     Args:
         model: the plant, of a known number of states.
@@ -34,6 +40,8 @@ class KalmanFilter(abc.ABC):
         noise: standard deviation of every output, q positive numbers.
         process: standard deviation of what disturbs each state in a second, one number or n, not negative:
             the variance grows by its square times the time.
+        periodic: outputs that are angles in rad, as a bearing by ``atan2`` is. Those that turn with a
+            periodic coordinate of the model, in any unit, are found without.
 
     Raises:
         ValueError: if an argument breaks its rule.
@@ -46,6 +54,7 @@ class KalmanFilter(abc.ABC):
         *,
         noise: Sequence[float],
         process: float | Sequence[float] = 0.0,
+        periodic: Sequence[int] = (),
     ) -> None:
         name, n = type(self).__name__, model._size()
         if not noise or not all(real(name, "noise", s) > 0 for s in noise):
@@ -56,6 +65,12 @@ class KalmanFilter(abc.ABC):
         seen = output(torch.zeros(1, n, dtype=torch.float64))
         if tuple(seen.shape) != (1, len(noise)):
             raise fail(name, "output", f"must map (1, {n}) to (1, {len(noise)})", tuple(seen.shape))
+        q = len(noise)
+        if not set(periodic) <= set(range(-q, q)):
+            raise fail(name, "periodic", f"must be places of {q} outputs", list(periodic))
+        angles = {index % q for index in periodic}
+        found = periods_of(output, n, model.periodic) if model.periodic else (0.0,) * q
+        self.periods = tuple(2 * math.pi if k in angles else found[k] for k in range(q))
 
     def step(self, belief: Belief, y: Tensor, dt: float, first: Tensor) -> Belief:
         """The belief after ``dt`` seconds with the input held, and the measurement y (..., q) then.
@@ -69,7 +84,7 @@ class KalmanFilter(abc.ABC):
         moved = self.predicted(belief, dt)
         mean = torch.where(first.unsqueeze(-1), belief.mean, moved.mean)
         covariance = torch.where(first[..., None, None], belief.covariance, moved.covariance)
-        return self.corrected(Belief(mean, covariance, belief.u), y)
+        return self.corrected(belief._replace(mean=mean, covariance=covariance), y)
 
     @abc.abstractmethod
     def predicted(self, belief: Belief, dt: float) -> Belief:
@@ -77,7 +92,15 @@ class KalmanFilter(abc.ABC):
 
     @abc.abstractmethod
     def corrected(self, belief: Belief, y: Tensor) -> Belief:
-        """The belief with a measurement (..., q)."""
+        """The belief with a measurement (..., q), NaN where it is missing."""
+
+    def left(self, y: Tensor, seen: Tensor) -> Tensor:
+        """y - seen, of outputs that are angles by the shorter way around: (..., q), (..., q) -> (..., q)."""
+        return wrap_each(y - seen, self.periods)
+
+    def counted(self, belief: Belief, y: Tensor) -> Tensor | None:
+        """`Belief.missed` after a measurement (..., q)."""
+        return None if belief.missed is None else belief.missed + y.isnan().to(belief.missed)
 
     def moved(self, x: Tensor, u: Tensor, dt: float) -> Tensor:
         """x after dt seconds with u held: (..., n), (..., m) -> (..., n)."""
@@ -116,22 +139,24 @@ class ExtendedKalman(KalmanFilter):
 
         mean, slope = row_jacobian(step, belief.mean)
         covariance = product(product(slope, belief.covariance), slope.mT)
-        return Belief(mean, covariance + self.disturbance(mean, dt), belief.u)
+        return belief._replace(mean=mean, covariance=covariance + self.disturbance(mean, dt))
 
     def corrected(self, belief: Belief, y: Tensor) -> Belief:
         mean, covariance = belief.mean, belief.covariance
         seen, slope = row_jacobian(self.output, mean)
-        left, variance = y - seen, self.noise.to(y).square()
+        missing, variance = y.isnan(), self.noise.to(y).square()
+        left = self.left(torch.where(missing, seen, y), seen)
         start = mean
         for k in range(y.shape[-1]):
             h = slope[..., k, :]
             ph = matvec(covariance, h)
             gain = ph / ((h * ph).sum(-1) + variance[k]).unsqueeze(-1)
+            gain = torch.where(missing[..., k : k + 1], 0.0, gain)
             # What the outputs before have changed counts to first order, as everywhere in this filter.
             new = left[..., k] - (h * (mean - start)).sum(-1)
             mean = mean + gain * new.unsqueeze(-1)
-            covariance = covariance - gain.unsqueeze(-1) * ph.unsqueeze(-2)
-        return Belief(mean, covariance, belief.u)
+            covariance = measured(covariance, gain, h, variance[k])
+        return Belief(mean, covariance, belief.u, self.counted(belief, y))
 
 
 class UnscentedKalman(KalmanFilter):
@@ -155,19 +180,25 @@ class UnscentedKalman(KalmanFilter):
     def predicted(self, belief: Belief, dt: float) -> Belief:
         points, weights = self._points(belief)
         held = belief.u.unsqueeze(-2).expand(*points.shape[:-1], -1)
-        mean, away = _mean(self.moved(points, held, dt), weights)
+        mean, away = _mean(self.moved(points, held, dt), weights, self.model.difference)
         spread = product((weights * away).mT, away)
-        return Belief(mean, spread + self.disturbance(mean, dt), belief.u)
+        return belief._replace(mean=mean, covariance=spread + self.disturbance(mean, dt))
 
     def corrected(self, belief: Belief, y: Tensor) -> Belief:
         points, weights = self._points(belief)
-        seen, off = _mean(self.output(points), weights)
-        variance = torch.diag(self.noise.to(y).square())
+        seen, off = _mean(self.output(points), weights, self.left)
+        missing, variance = y.isnan(), torch.diag(self.noise.to(y).square())
+        off = torch.where(missing.unsqueeze(-2), 0.0, off)
         inverse = torch.linalg.inv_ex(product((weights * off).mT, off) + variance)[0]
-        crossed = product((weights * (points - belief.mean.unsqueeze(-2))).mT, off)
-        gain = product(crossed, inverse)
-        mean = belief.mean + matvec(gain, y - seen)
-        return Belief(mean, belief.covariance - product(gain, crossed.mT), belief.u)
+        away = points - belief.mean.unsqueeze(-2)
+        gain = product(product((weights * away).mT, off), inverse)
+        mean = belief.mean + matvec(gain, self.left(torch.where(missing, seen, y), seen))
+        # The sum of squares that P - k S k' is, which rounding leaves positive; of no measurement P itself.
+        apart = away - product(off, gain.mT)
+        covariance = product((weights * apart).mT, apart) + product(product(gain, variance), gain.mT)
+        none = missing.all(-1)[..., None, None]
+        covariance = torch.where(none, belief.covariance, covariance)
+        return Belief(mean, covariance, belief.u, self.counted(belief, y))
 
     def _points(self, belief: Belief) -> tuple[Tensor, Tensor]:
         """The points (..., 2n + 1, n) and their weights (2n + 1, 1)."""
@@ -188,7 +219,9 @@ class Observing(NamedTuple):
 
 
 class Observed(Controller):
-    """A controller of x that is told the mean of a Kalman filter in place of x; what it sees is y.
+    """A controller of x that is told the mean of a Kalman filter in place of x; what it sees is y. The result
+    records the filter's ``mean`` and ``covariance``, and ``outputs_missed``: of each output, how many
+    measurements were NaN so far.
 
     Example:
         >>> plant, cost = systems.Pendulum(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
@@ -240,12 +273,16 @@ class Observed(Controller):
         rows, n, m = len(x0), len(self.guess), self.filter.model.inputs
         covariance = torch.diag(self.deviation.to(x0).square()).expand(rows, n, n).clone()
         mean = self.guess.to(x0).expand(rows, n).clone()
-        belief = Belief(mean, covariance, x0.new_zeros(rows, m))
+        missed = x0.new_zeros(rows, len(self.filter.noise))
+        belief = Belief(mean, covariance, x0.new_zeros(rows, m), missed)
         return Observing(belief, x0.new_zeros(rows), self.controller.init(mean))
 
     def recorded(self, carried: Observing) -> dict[str, Tensor]:
         belief, _, inner = carried
-        return {**self.controller.recorded(inner), "mean": belief.mean, "covariance": belief.covariance}
+        own = {"mean": belief.mean, "covariance": belief.covariance}
+        if belief.missed is not None:
+            own["outputs_missed"] = belief.missed
+        return {**self.controller.recorded(inner), **own}
 
     def step(self, x: Tensor, carried: Observing, uniform: Tensor, dt: float) -> tuple[Tensor, Observing]:
         belief, steps, inner = carried
@@ -256,7 +293,17 @@ class Observed(Controller):
         return u, Observing(belief._replace(u=held), steps + 1, inner)
 
 
-def _mean(points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """The weighted mean (..., k) of points (..., P, k), and what each is away from it."""
-    mean = (weights * points).sum(-2)
-    return mean, points - mean.unsqueeze(-2)
+def _mean(
+    points: Tensor, weights: Tensor, apart: Callable[[Tensor, Tensor], Tensor]
+) -> tuple[Tensor, Tensor]:
+    """The weighted mean (..., k) of points (..., P, k), and what each is away from it.
+
+    Args:
+        points: the first of them in the middle.
+        weights: (P, 1).
+        apart: the difference of two, by the shorter way around.
+    """
+    middle = points[..., :1, :]
+    away = apart(points, middle)
+    off = (weights * away).sum(-2, keepdim=True)
+    return (middle + off).squeeze(-2), away - off

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from ...lanes import Program, shared_program
 from ...lanes.shared_programs import number
 from ...lanes.tree import flatten, unflatten
+from ...numerics.angles import wrap
 from ...numerics.checks import choice, copied, fail, flag, positive_real
 from ...systems import Plant
 from ..problem.cost import Cost
@@ -45,7 +46,7 @@ class ClosedLoop(nn.Module):
             first where no limit is met, the second at most.
         renew: whether the control follows the state at every substep, in place of being held for dt. Of
             feedback laws alone.
-        limit: a row whose state exceeds it in norm has diverged.
+        limit: a row whose state, its angles in [-pi, pi], exceeds it in norm has diverged.
 
     Raises:
         ValueError: if an argument breaks its rule.
@@ -106,7 +107,8 @@ class ClosedLoop(nn.Module):
             )
         u = self.cost.admissible(u)
         x, spent = self._advance(state.x, u)
-        good = torch.isfinite(spent) & (x.square().sum(-1) <= self.limit**2)
+        size = wrap(x, self.system.periodic).square().sum(-1)  # an angle may turn as often as it likes
+        good = torch.isfinite(spent) & (size <= self.limit**2)
         parts, before = flatten(carried), flatten(state.carried)
         shapes, given = ([tuple(part.shape) for part in each[0]] for each in (parts, before))
         if parts[1] != before[1] or shapes != given:

@@ -27,19 +27,20 @@ EASIER, HARDER = 0.4, 8.0  # what success and failure do to the regularisation o
 # Of the regularisation, in units of the cost's curvature in u:
 LEAST, FIRST, TRUSTED, MOST = 1e-9, 1e-3, 1.0, 1e9
 CONVERGED = -1.0
+_ROUNDED = 4.0
 _NUMBERS = 2**25  # second derivatives that are held at once
 
 
 class Trajectories(NamedTuple):
     """Trajectories and the local models of the value along them: V(x) ~ V + g'd + d'Hd/2, d = x - x_k."""
 
-    state: Tensor  # (B, T + 1, n), not wrapped
+    state: Tensor  # (B, T + 1, n), angles as the step returned them
     control: Tensor  # (B, T, m)
     feedback: Tensor  # du/dx, (B, T, m, n); 0 where a bound holds
     value: Tensor  # cost from x_k on, (B, T + 1)
     gradient: Tensor  # g, (B, T + 1, n)
     curvature: Tensor  # H, (B, T + 1, n, n)
-    converged: Tensor  # (B,) bool: no step of the search promises or brings a relative gain of tolerance
+    converged: Tensor  # (B,) bool: no step promises or brings a gain of tolerance, or one above rounding
 
     @property
     def cost(self) -> Tensor:
@@ -104,7 +105,7 @@ def resting(problem: SampledProblem, goal: Tensor) -> Tensor:
 def around(problem: SampledProblem, x: Tensor, step: Tensor) -> Tensor:
     """The control of a `packed` step at another state than its own: (..., n), (..., w) -> (..., m)."""
     state, control, feedback = unpacked(problem, step)
-    return problem.admissible(control + (feedback * (x - state).unsqueeze(-2)).sum(-1))
+    return problem.admissible(control + (feedback * problem.offset(x, state).unsqueeze(-2)).sum(-1))
 
 
 Some = TypeVar("Some", bound=tuple[Tensor, ...])
@@ -150,7 +151,8 @@ class BoxDDP:
         problem: plant, cost and bounds in steps.
         steps: T.
         iterations: at most.
-        tolerance: relative change of the cost at which a row has converged, positive.
+        tolerance: relative change of the cost at which a row has converged, positive. So it has where only
+            rounding of states and controls is left to be gained, as of a cost that is 0.
         compile: whether `lanes` compiles the passes: some seconds of a C++ compiler for a plant that is new
             to its cache, and a hundred times faster then.
 
@@ -275,14 +277,15 @@ class BoxDDP:
 
     def _iterated(self, now: SearchState, known: Derivatives, terminal: LocalModel) -> SearchState:
         """Take one iteration: a backward pass, the best length of its change, the row's regularisation."""
-        end, (change, feedback, _, _) = self._backwards(now, known, now.mu, now.full, terminal)
+        end, (change, feedback, _, bent) = self._backwards(now, known, now.mu, now.full, terminal)
         definite = end.definite > 0
         around = now.state[:, :-1], now.control, change, feedback
         tried = self._best(now.state[:, 0], around, terminal)
         better = definite & (tried.cost < now.cost)
         gain = (now.cost - tried.cost) / now.cost.abs().clamp(min=1e-300)
         plan = chosen(better, tried, CostedTrajectories(*now[:4]))
-        small = end.promised.abs() <= self.tolerance * plan.cost.abs()
+        hidden = _rounding(now, known, bent)
+        small = end.promised.abs() <= self.tolerance * plan.cost.abs() + hidden
         done = ((better & (gain <= self.tolerance)) | (definite & small)) & (now.mu <= TRUSTED)
         mu = torch.where(better, (now.mu * EASIER).clamp(min=LEAST), now.mu * HARDER)
         going = torch.where(done, CONVERGED, (mu <= MOST).to(mu))
@@ -337,7 +340,7 @@ class BoxDDP:
     ) -> tuple[Tensor, tuple[Tensor, ...]]:
         """Take one step of all lengths: x (B, L, n), (B, n), (B, m), (B, m), (B, m, n), (B, L)."""
         state, control, change, feedback = now
-        apart = x - state.unsqueeze(1)
+        apart = self.problem.offset(x, state.unsqueeze(1))
         u = control.unsqueeze(1) + lengths.unsqueeze(-1) * change.unsqueeze(1)
         u = u + (feedback.unsqueeze(1) * apart.unsqueeze(-2)).sum(-1)
         u = self.problem.admissible(u)
@@ -424,6 +427,22 @@ class Model(NamedTuple):
     curvature: Tensor  # (B, n, n)
     promised: Tensor  # (B,)
     definite: Tensor  # (B,) 1 or 0
+
+
+def _rounding(plan: SearchState, known: Derivatives, curvature: Tensor) -> Tensor:
+    """The cost of relative errors of `_ROUNDED` rounding units in every state and control of a plan, (B,).
+
+    Args:
+        plan: states and controls.
+        known: derivatives along it.
+        curvature: of the value along it, (B, T, n, n).
+    """
+    state, control = plan.state[:, :-1].abs(), plan.control.abs()
+    size = control.shape[-1]
+    pulled = (curvature.abs() * state.unsqueeze(-2)).sum(-1)
+    pushed = (known.cost_second[..., -size:, -size:].abs() * control.unsqueeze(-2)).sum(-1)
+    paid = (pulled * state).sum((-2, -1)) + (pushed * control).sum((-2, -1))
+    return (_ROUNDED * torch.finfo(state.dtype).eps) ** 2 * paid
 
 
 def _definite(a: Tensor) -> Tensor:

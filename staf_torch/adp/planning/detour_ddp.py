@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from ...lanes import compiled, repeat, scan, traced_as
-from ...numerics.angles import wrap
 from ...numerics.box import LARGEST, minimum_and_slopes
 from ...numerics.checks import fail, integer, positive_real
 from ...numerics.forward_mode import use_forward_mode
@@ -185,14 +184,10 @@ class PlanProblem:
     def _stage(self, y: Tensor, others: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
         """Slope and curvature (Gauss and Newton's) of what the states of a period cost: (B, p), (B, p, p)."""
         cost = self.cost
-        see = (lambda x: x) if cost.output is None else cost.output
-        error, slope = _along(lambda y: see(self.whole(y, others)), y)
-        if cost.target is not None:
-            error = error - see(cost.target.to(y))
-        error = error if cost.output is not None else wrap(error, cost.periodic)
+        seen, slope = _along(lambda y: cost.outputs(self.whole(y, others)), y)
         heavy = 2 * self.hold * product(slope.mT, cost.q.to(y).expand(len(y), -1, -1))
         gradient, curvature = self._pressure(y, others, t)
-        return gradient + matvec(heavy, error), curvature + product(heavy, slope)
+        return gradient + matvec(heavy, cost.error(seen)), curvature + product(heavy, slope)
 
     def _end(self, y: Tensor, others: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
         """Slope and curvature of V_T, and of what is missing there."""

@@ -324,7 +324,7 @@ def follow_plan(
     x = first[:, :n] + problem.offset(x, first[:, :n])
     (last, paid), _ = scan(step, (x, torch.zeros_like(x[:, 0])), window)
     state, value, gradient, curvature = end.split((n, 1, n, n * n), dim=-1)
-    d = last - state
+    d = problem.offset(last, state)
     bent = (curvature.unflatten(-1, (n, n)) * d.unsqueeze(-2)).sum(-1)
     rest = value.squeeze(-1) + ((gradient + 0.5 * bent) * d).sum(-1)
     far = (d / region).square().sum(-1)

@@ -151,7 +151,8 @@ class SampledRollout(nn.Module):
         around = torch.cat((base.unsqueeze(-2) + probes, base.unsqueeze(-2) - probes), dim=-2)  # (..., 2m, m)
         moved, paid = self.holding(x.unsqueeze(-2).expand(*around.shape[:-1], x.shape[-1]), around)
         size, width = base.shape[-1], 2 * self.probe.to(x)
-        slopes = (moved[..., :size, :] - moved[..., size:, :]) / width.unsqueeze(-1)  # B', (..., m, n)
+        apart = self.plant.difference(moved[..., :size, :], moved[..., size:, :])
+        slopes = apart / width.unsqueeze(-1)  # B', (..., m, n)
         rise = (paid[..., :size] - paid[..., size:]) / width
         if self.along is None:
             known = self.rollout(self.basis.centers(after))

@@ -9,7 +9,7 @@ from typing import Self
 import torch
 from torch import Tensor, nn
 
-from ...numerics.angles import wrap
+from ...numerics.angles import periods_of, turned, wrap, wrap_each
 from ...numerics.box import LARGEST, box_minimum, face_inverses
 from ...numerics.checks import copied, fail, non_negative, one_or_each, positive, positive_real, real, vector
 from ...numerics.linalg import positive_definite, positive_semidefinite
@@ -44,6 +44,7 @@ class Cost(nn.Module, abc.ABC):
         target: the set-point, n numbers; None for the equilibrium of the plant.
         target_input: the input there, m numbers; None for the one that holds the plant there.
         output: y(x), (..., n) -> (..., p), in place of x: e = y(x) - y(target), and Q is (p, p) or a matrix.
+            x is turned to within pi of the target before; what turns with it is an angle itself.
         discount: rho in 1/s: what is paid at t counts exp(-rho t).
         terminal: S of e'Se, (n, n) or a number, paid where plans, shooting and rollouts end, in place of the
             LQR's value; None for an endless horizon, which all else is for. Not with an output or a discount.
@@ -92,6 +93,7 @@ class Cost(nn.Module, abc.ABC):
         )
         self.end: Tensor | None
         self.periodic: tuple[int, ...] = ()
+        self._periods: tuple[float, ...] = ()  # of the outputs
         bounds = Bounds(low, high, inputs)
         self.bounds: Bounds | None = bounds if bounds.present else None
         self._prepare()
@@ -120,6 +122,8 @@ class Cost(nn.Module, abc.ABC):
         placed.target = x if bool((x != 0).any()) else None
         placed.target_input = u if bool((u != 0).any()) else None
         placed.periodic = plant.periodic
+        if self.output is not None and self.periodic != plant.periodic:
+            placed._periods = periods_of(self.output, self.dim, plant.periodic)
         placed.bounds = plant.bounds if self.bounds is None else self.bounds
         same = all(getattr(placed, k) is getattr(self, k) for k in ("target", "target_input", "bounds"))
         if same and self.periodic == plant.periodic:
@@ -156,10 +160,21 @@ class Cost(nn.Module, abc.ABC):
 
     def state_rate(self, x: Tensor) -> Tensor:
         """e'Qe: (..., n) -> (...)."""
+        return quadratic(self.q, self.error(self.outputs(x)))
+
+    def outputs(self, x: Tensor) -> Tensor:
+        """y(x), of x turned to within pi of the target, or without an output x: (..., n) -> (..., p)."""
         if self.output is None:
-            return quadratic(self.q, self.deviation(x))
-        target = torch.zeros_like(x) if self.target is None else self.target.to(x).expand_as(x)
-        return quadratic(self.q, self.output(x) - self.output(target))
+            return x
+        target = x.new_zeros(x.shape[-1]) if self.target is None else self.target.to(x)
+        return self.output(turned(x, target, self.periodic))  # the output of an angle may be no angle
+
+    def error(self, y: Tensor) -> Tensor:
+        """e = y - y(target), angles by the shorter way around: (..., p) -> (..., p)."""
+        if self.output is None:
+            return self.deviation(y)
+        target = y.new_zeros(self.dim) if self.target is None else self.target.to(y)
+        return wrap_each(y - self.output(target), self._periods)
 
     def terminal(self, x: Tensor) -> Tensor:
         """e'Se, of a cost with a terminal cost: (..., n) -> (...)."""

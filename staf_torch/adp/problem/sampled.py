@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from ...lanes import each, traced_as
-from ...numerics.angles import wrap
+from ...numerics.angles import turned, unwrapped, wrap
 from ...numerics.checks import fail, integer, positive_real, trailing
 from ...numerics.forward_mode import use_forward_mode
 from ...numerics.linalg import discrete_riccati, positive_semidefinite
@@ -164,13 +164,14 @@ class SampledProblem(nn.Module):
         return wrap(x - center, self.periodic)
 
     def goals(self, x: Tensor, steps: int) -> Tensor:
-        """The goal after each of so many steps, 0 of them first, angles near those of x: (B, n) ->
-        (B, steps + 1, n)."""
+        """The goal after each of so many steps, 0 of them first: (B, n) -> (B, steps + 1, n). Angles of the
+        first are near those of x, of every other one near those of the one before."""
         if self.path is None:
             return (x - self.offset(x, self.goal)).unsqueeze(1).expand(-1, steps + 1, -1)
         time = x[:, -1:] + self.tick * torch.arange(steps + 1, dtype=x.dtype)
         goal = torch.cat((self.path(time), time.unsqueeze(-1)), dim=-1)
-        return x.unsqueeze(1) - self.offset(x.unsqueeze(1), goal)
+        begun = turned(goal[:, :1], x.unsqueeze(1), self.periodic)
+        return unwrapped(goal, self.periodic) + (begun - goal[:, :1])
 
     def away(self, x: Tensor) -> Tensor:
         """x - goal by the shorter way around: (..., n) -> (..., n)."""

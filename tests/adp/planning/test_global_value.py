@@ -169,19 +169,23 @@ def test_what_leaves_more_than_a_hundredth_has_not_arrived() -> None:
 def followed(known: adp.GlobalValue, x: Tensor, entry: int) -> tuple[float, Tensor, bool]:
     """What a remembered plan costs from x (n,), its first control, and whether it ends near its end."""
 
+    def apart(x: Tensor, y: Tensor) -> Tensor:
+        away = x - y
+        angle = torch.remainder(away[:1] + math.pi, 2 * math.pi) - math.pi
+        return torch.cat((angle, away[1:]))
+
     def control(x: Tensor, row: Tensor) -> Tensor:
-        u = row[N : N + M] + row[N + M :].view(M, N) @ (x - row[:N])
+        u = row[N : N + M] + row[N + M :].view(M, N) @ apart(x, row[:N])
         return torch.minimum(torch.maximum(u, PROBLEM.bounds.low), PROBLEM.bounds.high)
 
     first = known.plans[entry]
-    x = x.clone()
-    x[0] = first[0] + torch.remainder(x[0] - first[0] + math.pi, 2 * math.pi) - math.pi
+    x = first[:N] + apart(x, first[:N])
     u, paid = control(x, first), 0.0
     for k in range(AHEAD):
         x, now = pushed(x, control(x, known.plans[entry + k]))
         paid += float(now)
     model = known.models[entry + AHEAD]
-    d, value, bent = x - model[:N], float(model[N]), model[2 * N + 1 :].view(N, N)
+    d, value, bent = apart(x, model[:N]), float(model[N]), model[2 * N + 1 :].view(N, N)
     far = float((d / known.region).square().sum())
     if far >= 0.09:
         return paid + value + known.worst * (1 + far), u, False

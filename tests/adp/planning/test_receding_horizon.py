@@ -79,7 +79,7 @@ def test_first_plan_that_tries_held_bounds_finds_the_cheaper_way(memory: adp.Glo
         drive(adp.RecedingHorizon(memory.problem, steps=60, held=held), x, 80) for held in (False, True)
     )
     costs = [cost_of(memory.problem, x, controls) for controls, _ in (plain, held)]
-    assert bool((costs[0][:2] > 1.3 * costs[1][:2]).all())
+    assert bool((costs[0][:2] > tensor([1.05, 1.3]) * costs[1][:2]).all())
     torch.testing.assert_close(costs[0][2], costs[1][2])
     assert bool((costs[1] < 1.01 * memory.value(x))[[0, 2]].all())  # one corner, once: no swing-up
     assert float(memory.problem.terminal(held[1]).max()) < 1e-2

@@ -32,6 +32,7 @@ _REST = 1e-3  # share of the value that the terminal cost may be, before the hor
 _GRADING = 6.0  # ratio of a mesh's last interval to the first
 _DOUBLINGS = 3  # of the horizon
 _SPLINES = 8  # random guesses
+_ROUNDED = 4.0  # rounding units of the state, within which it is at the set-point
 
 
 class DirectShooting:
@@ -208,7 +209,12 @@ class DirectShooting:
             return found.converged
         ratio = found.value / self.lqr.value(x0)
         near = (ratio > _NEAR[0]) & (ratio < _NEAR[1]) & (followed <= _PLAIN * found.value)
-        return found.converged & ((x0 == 0).all(-1) | near)
+        return found.converged & (self._rests(x0, found.value) | near)
+
+    def _rests(self, x0: Tensor, value: Tensor) -> Tensor:
+        """Return where the optimum is to stay: at the set-point up to rounding, or at no cost, (B,) bool."""
+        rounding = _ROUNDED * torch.finfo(x0.dtype).eps * x0.abs()
+        return (self.stage.cost.deviation(x0).abs() <= rounding).all(-1) | (value == 0)
 
     def _guessed(self, x0: Tensor, time: Tensor) -> list[MeshPlan]:
         lengths, horizon = time.diff(), float(time[-1])
@@ -253,7 +259,7 @@ class DirectShooting:
         x0, plan = fine.plan.state[:, 0], fine.plan
         value = self._finer(fine, time.diff()).cost  # the same control, more exactly integrated
         left = self._left(fine, time) / value
-        rest = (self.stage.cost.deviation(x0) == 0).all(-1)  # where the optimum is to stay
+        rest = self._rests(x0, value)
         good = fine.converged & torch.isfinite(value) & (left <= _GAP)
         gradient = torch.where(rest.unsqueeze(-1), 0.0, fine.gradient)
         value = torch.where(rest, 0.0, value)
@@ -366,7 +372,7 @@ def _merged(found: Optimum, rows: Tensor, several: list[Optimum]) -> Optimum:
         if not finite:
             reasons[row] = found.reason[row]
         else:
-            most = max(finite) / min(finite)
+            most = max(finite) / min(finite) if min(finite) else math.inf
             local = f"local: one start alone found it, others up to {most:.3g} times as much"
             reasons[row] = "" if bool(converged[row]) else local
     columns["converged"] = converged
