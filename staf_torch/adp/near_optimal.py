@@ -16,7 +16,7 @@ from ..centers import StateFollowingCenters, cross_polytope
 from ..kernels import ExponentialKernel
 from ..lanes import ready, where_rows
 from ..numerics.checks import choice, fail, flag, positive_real
-from ..systems import Clocked, Linear, Plant
+from ..systems import Clocked, Plant
 from ..systems.bounds import Limit
 from .loop.controller import LQR, Controller, Feedback
 from .loop.simulation import simulate
@@ -28,19 +28,7 @@ from .policies.sampled_rollout import SampledRollout
 from .problem.cost import Cost
 from .problem.held_linear import HeldLoop, held_stability
 from .problem.sampled import SampledProblem
-from .reach import (
-    Followed,
-    Reach,
-    UnreachableError,
-    arrived,
-    box_of,
-    compared,
-    drawn,
-    follow_base,
-    learned,
-    sample,
-    sampled_problem,
-)
+from .reach import Reach, arrived, box_of, drawn, extended
 
 _log = logging.getLogger(__name__)
 _DECAY = 2.0  # time constants of the slowest mode of the LQR in the horizon
@@ -52,9 +40,7 @@ _TIMED, _TIMING = (20, 400), 1e5  # controls that are timed: at least, at most; 
 _SETTLED = 9.2  # time constants for which the loops of a report run: the slowest mode falls to 1e-4
 _TRIES, _PATIENCE = 8, 1.0  # controls, and s, after which a simulator is called slow
 _SHARE = 0.5  # of a period that a control may take without a warning: another half for a slower moment
-_DEAR = 4.0  # times the value of the LQR that it may cost within its bounds, to be a base
 _WAYS = ("auto", "local", "global")
-_GOOD = 1.02  # mean cost over the best known, beyond which the log warns
 
 
 class NearOptimal(SampledRollout):
@@ -157,8 +143,9 @@ class NearOptimal(SampledRollout):
         Returns:
             ``dt``, ``base``, ``centers``, ``radius``, ``horizon`` in s, ``substeps``; ``spectral_radius`` and
             ``largest_period`` of the held linearised loop; ``reach``, ``local`` or ``global``; ``spread``;
-            ``regulated``, the share of the states that end within 1 % of where they began; ``over_base_median`` and ``over_base_max``, the
-            cost over the LQR's in the states that both regulate; ``over_optimum_median`` and
+            ``regulated``, the share of the states that end within 1 % of where they began;
+            ``over_base_median`` and ``over_base_max``, the cost over the LQR's in the states that both
+            regulate; ``over_optimum_median`` and
             ``over_optimum_max`` likewise (the optimum is not held: part of it is the price of holding), None
             where it is not known; ``good_spread``, the largest of 1/4, 1/2, 1, 2, 4 times the spread at which
             all are regulated, else of 1/8 to 1/4096, 0 if none; ``microseconds`` a control of one row, the
@@ -258,7 +245,7 @@ def near_optimal(
     plan: bool = False,
     reach: str = "auto",
 ) -> NearOptimal:
-    """A policy for a plant, held for dt, that costs no more than its LQR, and leads to the set-point from a box.
+    """A policy for a plant, held for dt: never dearer than its LQR, and to the set-point from all of a box.
 
     **Reach.** The box is the plant's ``spread`` around the set-point, and of periodic coordinates the whole
     turn. The LQR is followed within its bounds from 24 states of it and the ends of its axes, in less than
@@ -271,11 +258,11 @@ def near_optimal(
     are left that are not regulated, or cost more than 1.02 of the best trajectories known, or where nobody
     could look, the log has one warning with the numbers; ``policy.reach`` and ``report()`` keep them.
 
-    **Local.** The rules: the base is the LQR made for dt; the horizon is two time constants of its slowest mode (three
-    with plans), 12 to 60 periods, four quarters; 2 m + 1 centers lie along the m inputs, at ``radius``
-    from the state and on it, as `SampledRollout` says (with more inputs than states, around the state as many
-    as quadratics need); a plant in continuous time is integrated in steps of a fifth of its fastest time
-    constant.
+    **Local.** The rules: the base is the LQR made for dt; the horizon is two time constants of its slowest
+    mode (three with plans), 12 to 60 periods, four quarters; 2 m + 1 centers lie along the m inputs, at
+    ``radius`` from the state and on it, as `SampledRollout` says (with more inputs than states, around the
+    state as many as quadratics need); a plant in continuous time is integrated in steps of a fifth of its
+    fastest time constant.
 
     Rollouts of an LQR do not know what to do before a bound of the inputs. Where the LQR, followed from x
     over the horizon, meets one (``report()`` says how often, ``strained``), the policy's ``controller()``,
@@ -345,68 +332,8 @@ def near_optimal(
     if not plant.traceable:
         _warn_if_slow(policy)
     if reach != "local":
-        _extend(policy, reach)
+        policy.reach, policy.memory = extended(policy, lqr, policy.box, policy.settles, reach)
     return policy
-
-
-def _extend(policy: NearOptimal, reach: str) -> None:
-    """Look how far the base leads and, where that is not enough, learn a global value."""
-    x0, linear = sample(policy.cost, policy.box), type(policy.plant) is Linear and not policy.bounds.present
-    if linear and reach == "auto":
-        policy.reach = policy.reach._replace(regulated=1.0, base=1.0)
-        return
-    base = follow_base(policy, x0, 2 * policy.settles)
-    share = float(base.regulated.double().mean())
-    dear = policy.bounds.present & (base.cost > _DEAR * policy.lqr.value(x0))
-    if reach == "auto" and (not base.known or bool((base.regulated & ~dear).all())):
-        note = "" if base.known else "the simulation of the LQR was stopped after 0.4 s"
-        known = share if base.known else None
-        policy.reach = policy.reach._replace(regulated=known, base=known, note=note)
-        if not base.known:
-            _log.warning(
-                "near_optimal did not look how far the LQR leads: to follow it from %d states of the box %s "
-                "takes longer than 0.4 s (%.0f %% had arrived by then). `report()` looks.",
-                *(len(x0), _shown(policy.box), 100 * share),
-            )
-        return
-    try:
-        _learn(policy, x0, base)
-    except UnreachableError as error:
-        if reach == "global":
-            raise fail("near_optimal", "reach", f"must be local here: {error}", reach) from error
-        policy.reach = policy.reach._replace(regulated=share, base=share, note=str(error))
-        _log.warning(
-            "near_optimal: the LQR regulates %.0f %% of %d states of the box %s, and its rollouts promise no "
-            "more. There is no global value: %s",
-            *(100 * share, len(x0), _shown(policy.box), error),
-        )
-
-
-def _learn(policy: NearOptimal, x0: Tensor, base: Followed) -> None:
-    """Give a policy the global value of its box, and say how good it is."""
-    share = float(base.regulated.double().mean())
-    problem = sampled_problem(policy.plant, policy.cost, policy.period)
-    _log.info(
-        "near_optimal: the LQR regulates %.0f %% of %d states of the box %s: learning a global value",
-        *(100 * share, len(x0), _shown(policy.box)),
-    )
-    policy.memory = learned(problem, policy.box, policy.settles)
-    found = compared(policy.memory, policy.cost, x0)
-    best = torch.where(base.regulated, torch.minimum(base.cost, found.best), found.best)
-    good = found.regulated
-    over = float(found.cost[good].sum() / best[good].sum()) if bool(good.any()) else math.inf
-    known = float(good.double().mean())
-    policy.reach = Reach("global", policy.reach.box, known, over, share)
-    if known < 1 or over > _GOOD:
-        _log.warning(
-            "near_optimal: its global value regulates %.0f %% of %d states of the box %s (the LQR %.0f %%), "
-            "at %.3g times the best cost known in the mean.",
-            *(100 * known, len(x0), _shown(policy.box), 100 * share, over),
-        )
-
-
-def _shown(box: Tensor) -> str:
-    return "+-(" + ", ".join(f"{width:.3g}" for width in box.tolist()) + ")"
 
 
 def _periods(seconds: float, period: float) -> int:

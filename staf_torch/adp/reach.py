@@ -10,7 +10,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..systems import Plant
+from ..numerics.checks import fail
+from ..systems import Bounds, Linear, Plant
+from ..systems.user_plants import FunctionPlant
+from .loop.controller import LQR
 from .planning.ddp import BoxDDP
 from .planning.global_value import GlobalValue
 from .planning.global_value_learning import best_from, learn_global_value
@@ -27,6 +30,8 @@ _BUDGET = 0.4  # s that following the base may take
 _DIMS, _INPUTS = 6, 2  # at most, of a plant whose global value is learnt
 _STEPS = (60, 480)  # periods of a trajectory of the global value, at least and at most
 _SEED = 7
+_DEAR = 4.0  # times the value of the LQR that it may cost within its bounds, to be a base
+_GOOD = 1.02  # mean cost over the best known, beyond which the log warns
 
 
 class Reach(NamedTuple):
@@ -66,6 +71,76 @@ def arrived(cost: Cost, x: Tensor, x0: Tensor) -> Tensor:
     return torch.isfinite(left) & (left <= REGULATED * began)
 
 
+def extended(
+    policy: SampledRollout, lqr: LQR, box: Tensor, settles: int, way: str
+) -> tuple[Reach, GlobalValue | None]:
+    """How far a base leads and, where that is not enough, a global value; the log says what is left.
+
+    Args:
+        policy: with the base.
+        lqr: the base itself.
+        box: half widths, (n,).
+        settles: periods after which the slowest mode of the base has fallen to 1e-4.
+        way: ``auto`` or ``global``.
+
+    Raises:
+        ValueError: if the way is ``global`` and there is no global value.
+    """
+    cost, x0, widths = policy.cost, sample(policy.cost, box), tuple(box.tolist())
+    if type(policy.plant) is Linear and not policy.bounds.present and way == "auto":
+        return Reach("local", widths, 1.0, None, 1.0), None
+    base = follow_base(policy, x0, 2 * settles)
+    share = float(base.regulated.double().mean())
+    if way == "auto" and not base.known:
+        _log.warning(
+            "near_optimal did not look how far the LQR leads: to follow it from %d states of the box %s "
+            "takes longer than 0.4 s (%.0f %% had arrived by then). `report()` looks.",
+            *(len(x0), _shown(box), 100 * share),
+        )
+        note = "the simulation of the LQR was stopped after 0.4 s"
+        return Reach("local", widths, None, None, None, note), None
+    dear = policy.bounds.present & (base.cost > _DEAR * lqr.value(x0))
+    if way == "auto" and bool((base.regulated & ~dear).all()):
+        return Reach("local", widths, share, None, share), None
+    try:
+        problem = sampled_problem(policy.plant, cost, policy.period, x0)
+        _log.info(
+            "near_optimal: the LQR regulates %.0f %% of %d states of the box %s: learning a global value",
+            *(100 * share, len(x0), _shown(box)),
+        )
+        memory = learned(problem, box, settles)
+    except UnreachableError as error:
+        if way == "global":
+            raise fail("near_optimal", "reach", f"must be local here: {error}", way) from error
+        _log.warning(
+            "near_optimal: the LQR regulates %.0f %% of %d states of the box %s, and its rollouts promise no "
+            "more. There is no global value: %s",
+            *(100 * share, len(x0), _shown(box), error),
+        )
+        return Reach("local", widths, share, None, share, str(error)), None
+    return _judged(memory, cost, x0, base, box), memory
+
+
+def _judged(memory: GlobalValue, cost: Cost, x0: Tensor, base: Followed, box: Tensor) -> Reach:
+    """How far a global value leads from x0 (B, n)."""
+    share, found = float(base.regulated.double().mean()), compared(memory, cost, x0)
+    best = torch.where(base.regulated, torch.minimum(base.cost, found.best), found.best)
+    good = found.regulated
+    over = float(found.cost[good].sum() / best[good].sum()) if bool(good.any()) else math.inf
+    known = float(good.double().mean())
+    if known < 1 or over > _GOOD:
+        _log.warning(
+            "near_optimal: its global value regulates %.0f %% of %d states of the box %s (the LQR %.0f %%), "
+            "at %.3g times the best cost known in the mean.",
+            *(100 * known, len(x0), _shown(box), 100 * share, over),
+        )
+    return Reach("global", tuple(box.tolist()), known, over, share)
+
+
+def _shown(box: Tensor) -> str:
+    return "+-(" + ", ".join(f"{width:.3g}" for width in box.tolist()) + ")"
+
+
 class Followed(NamedTuple):
     """Where a base leads."""
 
@@ -95,14 +170,20 @@ class UnreachableError(ValueError):
     """Why a plant has no global value."""
 
 
-def sampled_problem(plant: Plant, cost: Cost, period: float) -> SampledProblem:
-    """The plant and its cost in steps, as a global value needs them.
+def sampled_problem(plant: Plant, cost: Cost, period: float, x: Tensor) -> SampledProblem:
+    """The plant and its cost in steps, as a global value needs them. x (B, n) are states of the box.
 
     Raises:
         UnreachableError: that says why there is none.
     """
+    if isinstance(plant, FunctionPlant):
+        levels = Bounds(-1.0, 1.0, cost.inputs) if cost.bounds is None else cost.bounds
+        at = torch.linspace(0, 1, len(x), dtype=torch.float64).unsqueeze(1)
+        low, high = levels.low.clamp(min=-1e3), levels.high.clamp(max=1e3)
+        plant = plant.in_torch(x, low + at * (high - low)) or plant
     if not plant.traceable:
-        raise UnreachableError("a global value needs a plant that is torch all through")
+        rule = "torch all through, or one function in NumPy that torch can follow (no np.array, no branches)"
+        raise UnreachableError(f"it needs a plant that is {rule}")
     if cost.dim > _DIMS or cost.inputs > _INPUTS:
         raise UnreachableError(f"a global value is learnt of at most {_DIMS} states and {_INPUTS} inputs")
     try:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ..numerics.differences import Apart, central_slopes
 from .base import Linearisation
+from .numpy_in_torch import InTorch, agrees
 
 Motion = Callable[..., Any]
 """(x (B, n), u (B, m)) -> (B, n), of torch tensors or of NumPy arrays."""
@@ -50,6 +51,16 @@ class BlackBox:
         self._call, self._function, self._slopes = call, function, slopes
         self.torch = self._traces(x, u)
         self._try(x, u)
+
+    def in_torch(self, x: Tensor, u: Tensor) -> BlackBox | None:
+        """The function by torch, where that follows it through NumPy and agrees at x (B, n), u (B, m)."""
+        if not agrees(self._function, x, u):
+            return None
+        try:
+            box = BlackBox(self._call, InTorch(self._function), x[0], u[0])
+        except ValueError:
+            return None
+        return box if box.torch else None
 
     def __call__(self, x: Tensor, u: Tensor) -> Tensor:
         """(..., n), (..., m) -> (..., n)."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -48,6 +50,25 @@ class FunctionPlant(Plant):
     @property
     def traceable(self) -> bool:
         return self.function.torch
+
+    def in_torch(self, x: Tensor, u: Tensor) -> Self | None:
+        """The same plant with a function that torch follows through NumPy, itself where it is torch already.
+
+        Args:
+            x: states at which the two must agree to rounding, (B, n).
+            u: inputs likewise, (B, m).
+
+        Returns:
+            None of a plant that is more than its function, and where torch cannot follow or disagrees.
+        """
+        if self.traceable:
+            return self
+        box = self.function.in_torch(x, u) if type(self) in (StepPlant, RatePlant) else None
+        if box is None:
+            return None
+        twin = copy.copy(self)
+        twin.function = box
+        return twin
 
     def equilibrium(self) -> Tensor:
         return self._rest[0]
