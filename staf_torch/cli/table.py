@@ -12,10 +12,18 @@ from pathlib import Path
 from ..results.files import RUNNING, UNFINISHED, write_bytes
 from ..results.reader import Collection, collect
 from ..results.untrusted import visible
-from ..tables import Layout, Style, Table, json_text, latex_text, parquet_bytes, tabulate
+from ..tables import Layout, Print, Style, Table, json_text, latex_text, parquet_bytes, tabulate
 from ..tables.aggregate import AGGREGATES
+from ..tables.latex import parts
 
-_READ: dict[str, Callable[[Table], str]] = {"md": Table.markdown, "tex": latex_text}
+
+def markdown_text(table: Table, about: Print) -> str:
+    """Return the table in Markdown, or one for each value of a setting with a line above."""
+    texts = [(value, part.markdown()) for value, part in parts(table, about.split)]
+    return "\n".join(f"{value}\n\n{text}" if value else text for value, text in texts)
+
+
+_READ: dict[str, Callable[[Table, Print], str]] = {"md": markdown_text, "tex": latex_text}
 """For people: few digits, mean and deviation in one column."""
 _PLAIN: dict[str, Callable[[Table], str]] = {"csv": Table.csv, "json": json_text}
 """For programs: all columns and every digit."""
@@ -26,6 +34,7 @@ examples:
   staf-table runs/<sweep> --rows kernel,centers.radius --columns centers.count --metric ball_error
   staf-table runs/* --aggregate mean,ci95 --metric ball_error,gradient_error --sort ball_error:desc
   staf-table runs/<sweep> --format tex --best bold --output table.tex
+  staf-table runs/<sweep> --format tex --split kernel --caption "Errors." --label tab:errors
 """
 
 
@@ -92,6 +101,21 @@ def _parser() -> argparse.ArgumentParser:
     for name, text in lists.items():
         parser.add_argument(f"--{name}", help=text, type=_names, default=(), metavar="NAME,...")
     parser.add_argument("--best", choices=("bold",), help="the best number of each column (md, tex)")
+    parser.add_argument("--split", metavar="SETTING", help="a table for each of its values (md, tex)")
+    parser.add_argument(
+        "--caption", metavar="TEXT", help="of a `table` environment; meanings follow it (tex)"
+    )
+    parser.add_argument("--label", metavar="TEXT", help="for \\ref, with a caption (tex)")
+    parser.add_argument(
+        "--wide", action="store_true", help="over both columns of a page, with a caption (tex)"
+    )
+    parser.add_argument(
+        "--rename",
+        type=_pairs,
+        default={},
+        metavar="NAME=TEXT,...",
+        help="write settings, metrics or texts in cells otherwise; TEXT is LaTeX (tex)",
+    )
     parser.add_argument("--digits", type=int, default=3, help="significant digits of md and tex (3)")
     parser.add_argument(
         "--watch",
@@ -109,6 +133,14 @@ def _names(text: str) -> tuple[str, ...]:
     return tuple(name for part in text.split(",") if (name := part.strip()))
 
 
+def _pairs(text: str) -> dict[str, str]:
+    pairs = [part.partition("=") for part in _names(text)]
+    for name, equals, _ in pairs:
+        if not equals:
+            raise argparse.ArgumentTypeError(f"must be NAME=TEXT,...; got {name!r}")
+    return {name.strip(): written.strip() for name, _, written in pairs}
+
+
 def _rendered(found: Collection, options: argparse.Namespace) -> bytes:
     kind = options.format
     if options.digits < 1:
@@ -123,8 +155,11 @@ def _rendered(found: Collection, options: argparse.Namespace) -> bytes:
         style=Style(options.digits, options.best == "bold"),
     )
     table = tabulate(found, layout)
-    if kind != "parquet":
-        return (_READ | _PLAIN)[kind](table).encode()
+    about = Print(options.caption, options.label, options.rename, options.split, options.wide)
+    if kind in _READ:
+        return _READ[kind](table, about).encode()
+    if kind in _PLAIN:
+        return _PLAIN[kind](table).encode()
     if options.output is None:
         raise ValueError("`staf-table --format parquet` needs --output FILE.")
     return parquet_bytes(table)

@@ -70,6 +70,10 @@ class PrintedColumn:
     over: str  # the heading above that it shares with its neighbours; empty: none
     cells: tuple[Number | str | None, ...]
     best: frozenset[int] = frozenset()  # rows
+    name: str = ""  # of the setting or the metric
+    metric: bool = False
+    at: str = ""  # `centers.count=3` where a metric is spread over columns
+    what: str = ""  # `mean ± std`, `max`: what of several runs
 
     @functools.cached_property
     def numeric(self) -> bool:
@@ -99,7 +103,9 @@ def printed(columns: Sequence[Column], rows: Sequence[Row], style: Style) -> lis
         cells = tuple(_cell(row.cells.get(column.name)) for row in rows)
         if column.shown and column.statistic is None:
             best = _best(cells, column, style)
-            found.append(PrintedColumn(column.heading or column.name, "", cells, best))
+            name = "" if column.heading else column.name
+            measured = column.metric is not None
+            found.append(PrintedColumn(column.heading or column.name, "", cells, best, name, measured))
     if any(column.statistic is not None for column in columns):
         return [*found, *_aggregated(columns, rows, style), *_counts(columns, rows)]
     return [c for c in found if c.heading != "status" or set(c.cells) != {"completed"}]  # which says nothing
@@ -124,13 +130,13 @@ def _aggregated(columns: Sequence[Column], rows: Sequence[Row], style: Style) ->
         shown = [c for name, c in here.items() if name not in _COUNTS and c is not spread]
         for column in shown:
             joined = spread if column.statistic == "mean" else None
-            what = "" if single and column.statistic == "mean" else column.statistic
+            what = "" if single and column.statistic == "mean" else str(column.statistic)
             what = f"mean ± {joined.statistic}" if joined is not None else what
             cells = tuple(_joined(row.cells, column, joined) for row in rows)
             alone = at and len(shown) == 1  # the statistic joins the heading above
             heading = ", ".join(filter(None, (at or metric, "" if alone else what)))
             over = ", ".join(filter(None, (metric, what if alone else ""))) if at else ""
-            yield PrintedColumn(heading, over, cells, _best(cells, column, style))
+            yield PrintedColumn(heading, over, cells, _best(cells, column, style), metric, True, at, what)
 
 
 def _joined(cells: Mapping[str, Value], column: Column, spread: Column | None) -> Number | None:
@@ -147,7 +153,7 @@ def _counts(columns: Sequence[Column], rows: Sequence[Row]) -> Iterator[PrintedC
         names = [column.name for column in columns if column.statistic == count]
         cells = tuple(_range([row.cells[name] for name in names]) for row in rows)
         if count == "n" or any(cell != Number(0) for cell in cells):
-            yield PrintedColumn(count, "", cells)
+            yield PrintedColumn(count, "", cells, name=count)
 
 
 def _range(counts: Sequence[Value]) -> Number | str:

@@ -1,4 +1,4 @@
-"""A table: rows of plain values, as Markdown and LaTeX for people, as CSV, JSON and Parquet for programs."""
+"""A table: rows of plain values, as Markdown and HTML for people, as CSV, JSON and Parquet for programs."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import dataclasses
 import html
 import importlib
 import io
-import itertools
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -16,24 +15,8 @@ from typing import Any
 
 from ..results.reader import Value
 from ..results.untrusted import visible
-from .columns import Column, Number, PrintedColumn, Row, Style, printed, show, significant
+from .columns import Column, Number, PrintedColumn, Row, Style, printed, show
 
-_SPECIAL = {character: f"\\{character}" for character in "{}$&#_%"} | {
-    "\\": r"\textbackslash{}",
-    "^": r"\textasciicircum{}",
-    "~": r"\textasciitilde{}",
-    "<": r"\textless{}",
-    ">": r"\textgreater{}",
-    "|": r"\textbar{}",
-    '"': r"\symbol{34}",
-    "'": r"\textquotesingle{}",
-    "`": r"\textasciigrave{}",
-    "-": "-{}",  # not the ligature of two of them
-    "[": "{[}",  # not the argument of the line end before it
-    "]": "{]}",
-    "*": "{*}",
-    "±": r"\ensuremath{\pm}",
-}
 _LINK = re.compile(r"\]\s*[(\[:]")
 # What a spreadsheet computes, wide letters too.
 _FORMULA = re.compile("\\s*[=+\\-@|%\uff1d\uff0b\uff0d\uff20]|[\\t\\r]")
@@ -152,63 +135,6 @@ def _escaped(text: str) -> str:
         for inside, part in ((bool(code and n % 2), part) for n, part in enumerate(parts))
     ]
     return _BLOCK.sub(r"\\\g<0>", ("`" if code else "\\`").join(found))
-
-
-def latex_text(table: Table) -> str:
-    r"""Return a `tabular`; the document needs `\usepackage{booktabs}`, and `textcomp` before LaTeX of 2020.
-
-    Why runs have no result stands below it as comments.
-
-    Example:
-        >>> done = sweep("centers.radius=0.1,0.2", "duration=0.1", "settle_time=0", "figures=false")
-        >>> latex_text(done.table(metrics=("ball_error",))).count("tabular")
-        2
-
-        Shown by `staf-table runs --format tex`.
-    """
-    columns, digits = table.printed(), table.style.digits
-    align = "".join("r" if column.numeric else "l" for column in columns)
-    lines = [r"\begin{tabular}{" + align + "}", r"\toprule", *_headings(columns), r"\midrule"]
-    cells = table.texts(escape, lambda number: _number(number, digits), "--", r"\boldmath\textbf{{{}}}")
-    lines += [" & ".join(row) + r" \\" for row in cells]
-    lines += [r"\bottomrule", r"\end{tabular}"]
-    lines += ["% " + " ".join(visible(note).split()) for note in table.notes]
-    return "\n".join(lines) + "\n"
-
-
-def _headings(columns: list[PrintedColumn]) -> list[str]:
-    """Return a line, or two with a rule under what several columns share."""
-    lower = " & ".join(escape(column.heading) for column in columns) + r" \\"
-    if not any(column.over for column in columns):
-        return [lower]
-    upper, rules, at = [], [], 1
-    for over, group in itertools.groupby(columns, key=lambda column: column.over):
-        width = len(list(group))
-        if over:
-            upper.append(rf"\multicolumn{{{width}}}{{c}}{{{escape(over)}}}")
-            rules.append(rf"\cmidrule(lr){{{at}-{at + width - 1}}}")
-        else:
-            upper += [""] * width
-        at += width
-    return [" & ".join(upper) + r" \\", "".join(rules), lower]
-
-
-def _number(number: Number, digits: int) -> str:
-    text = _power(significant(number.value, digits))
-    if number.spread is not None:
-        text += r" \pm " + _power(significant(number.spread, 2))
-    return f"${text}$"
-
-
-def _power(text: str) -> str:
-    """1.2e-05 as 1.2 x 10^-5."""
-    mantissa, e, exponent = text.partition("e")
-    return rf"{mantissa} \times 10^{{{int(exponent)}}}" if e else mantissa
-
-
-def escape(text: str) -> str:
-    """Return what makes LaTeX print a text as it is, on one line."""
-    return "".join(_SPECIAL.get(character, character) for character in " ".join(visible(text).split()))
 
 
 def json_text(table: Table) -> str:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 import json
 import math
+import shutil
+import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,8 +20,9 @@ from tables.test_aggregation import PIVOT
 
 from staf_torch.results.reader import Collection, collect
 from staf_torch.tables import Layout, Style, Table, html_text, json_text, latex_text, parquet_bytes, tabulate
-from staf_torch.tables.columns import Column, Row, printed, significant
-from staf_torch.tables.model import data_frame, escape
+from staf_torch.tables.columns import Column, Number, Row, printed, significant
+from staf_torch.tables.latex import Print, escape, number_text
+from staf_torch.tables.model import data_frame
 
 
 @pytest.fixture(scope="module")
@@ -91,9 +95,10 @@ def test_markdown_joins_mean_and_spread_and_marks_the_best(found: Collection) ->
 def test_latex_has_booktabs_two_lines_of_headings_and_powers_of_ten(found: Collection) -> None:
     text = latex_text(tabulate(found, PIVOT))
     lines = text.splitlines()
-    assert lines[0] == r"\begin{tabular}{lrrrrll}"
-    assert lines[2] == r" &  & \multicolumn{3}{c}{ball\_error, mean \ensuremath{\pm} std} &  &  \\"
+    assert lines[0] == r"\begin{tabular}{@{}lrrrrll@{}}"
+    assert lines[2] == r" &  & \multicolumn{3}{c}{$\sup |V - \hat V|$} &  &  \\"
     assert lines[3] == r"\cmidrule(lr){3-5}"
+    assert lines[4] == r"kernel & $r$ & $M$ = 3 & $M$ = 6 & $M$ = 7 & n & failed \\"
     assert [line for line in lines if "rule" in line and "cmid" not in line] == [
         r"\toprule",
         r"\midrule",
@@ -102,9 +107,64 @@ def test_latex_has_booktabs_two_lines_of_headings_and_powers_of_ten(found: Colle
     body = lines[lines.index(r"\midrule") + 1 : lines.index(r"\bottomrule")]
     assert len(body) == 4
     assert all(line.endswith(r" \\") and line.count(" & ") == 6 for line in body)
-    assert r"\boldmath\textbf{$0.00064 \pm 1.5 \times 10^{-5}$}" in body[0]
+    assert r"\boldmath\textbf{$(6.40 \pm 0.15) \times 10^{-4}$}" in body[0]
+    assert "largest error in the ball; $M$: number of centers. Mean $\\pm$ standard deviation.\n" in text
     assert lines[-2].startswith("% 12 of 36 failed")
     assert lines[-1] == "% `kernel` was swept and changed no metric in any row."
+
+
+@pytest.mark.parametrize(
+    ("value", "spread", "written"),
+    [
+        (2.57e-3, 8.3e-5, r"(2.57 \pm 0.08) \times 10^{-3}"),
+        (0.1, None, "0.100"),
+        (0.0559, 5.4e-4, r"0.0559 \pm 0.0005"),
+        (9.999e-3, 1e-9, r"0.0100 \pm 0.0000"),
+        (1e-4, 3e-2, r"0.0001 \pm 0.0300"),
+        (-123456.7, None, r"-1.23 \times 10^{5}"),
+        (12.0, None, "12"),
+        (0.0, 0.0, r"0.00 \pm 0.00"),
+        (math.inf, None, r"\infty"),
+        (1.0, math.nan, r"1 \pm \mathrm{nan}"),
+    ],
+)
+def test_a_mean_and_its_spread_have_one_power_of_ten(
+    value: float, spread: float | None, written: str
+) -> None:
+    assert number_text(Number(value, spread), 3) == f"${written}$"
+
+
+def test_a_table_is_set_in_a_column_of_a_page_without_a_hand_edit(found: Collection, tmp_path: Path) -> None:
+    layout = Layout(rows=("kernel", "centers.radius"), metrics=("ball_error", "gradient_error"))
+    table = tabulate(found, layout)
+    about = Print("Errors of \\emph{all} runs.", "tab:e", {"gaussian": "Gauss", "kernel": "$k$"}, "kernel")
+    text = latex_text(table, about)
+    assert text.count(r"\begin{table}") == text.count(r"\caption{Errors of \emph{all} runs. $r$: ") == 2
+    assert "$k$ = exponential.}" in text
+    assert "$k$ = Gauss.}" in text
+    assert r"\label{tab:e-gaussian}" in text
+    wide = latex_text(table, dataclasses.replace(about, split=None, wide=True))
+    assert r"\begin{table*}" in wide
+    assert "Gauss &" in wide
+    for wrong in Print(label="x"), Print(split="no_such"):
+        with pytest.raises(ValueError, match=r"`staf-table --(label|split)`"):
+            latex_text(table, wrong)
+    if shutil.which("pdflatex") is None:
+        pytest.skip("without pdflatex")
+    page = r"\documentclass[twocolumn]{article}\usepackage{booktabs}\begin{document}%s\end{document}"
+    (tmp_path / "page.tex").write_text(page % (text + wide), encoding="utf-8")
+    line = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "page.tex"]
+    said = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert said.returncode == 0, said.stdout
+    assert "Overfull" not in said.stdout
+
+
+def test_a_column_that_only_repeats_another_is_left_out() -> None:
+    columns = (Column("a"), Column("m", "m"), Column("k", "k"))
+    rows = tuple(Row({"a": n, "m": 0.1 * n, "k": 0.1 * n + 1e-6}) for n in (1, 2))
+    text = latex_text(Table(columns, rows))
+    assert text.count(" & ") == 3  # a and m, of three lines
+    assert "% k is m to the digits printed." in text
 
 
 def test_latex_prints_every_special_character_as_it_is() -> None:
