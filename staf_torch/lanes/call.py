@@ -140,7 +140,7 @@ class PlannedCall:
         self._dtypes = [
             (k, dtype) for k, (_, dtype) in enumerate((*compiled.carry, *compiled.outputs)) if dtype != real
         ]
-        self._like = torch.empty(0, dtype=real)
+        self._like = torch.empty(0, dtype=real, device="cpu")  # whatever the default device is
         for k, (shape, _) in enumerate(self._rooms):
             if torch.Size(shape).numel() * self._like.element_size() >= LARGE:
                 self._large.append(k)
@@ -173,7 +173,8 @@ class PlannedCall:
             given = [leaf.tensor if type(leaf) is Shared else leaf for leaf in leaves]
             for k in self._copied:
                 given[k] = given[k].to(real).contiguous()
-        rooms = [torch.empty_strided(shape, strides, dtype=real) for shape, strides in self._rooms]
+        empty = torch.empty_strided
+        rooms = [empty(shape, strides, dtype=real, device="cpu") for shape, strides in self._rooms]
         for k in self._large:
             shape, strides = self._rooms[k]
             rooms[k] = fresh(self._like, torch.Size(shape).numel()).as_strided(shape, strides)

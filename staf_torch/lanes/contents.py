@@ -81,6 +81,14 @@ class Derived:
     """Base of what follows from its recipe in a pickle, as programs do: nothing inside of it is watched."""
 
 
+def version(tensor: Tensor) -> int:
+    """Return a number that is another one once the tensor was written to.
+
+    Torch counts writes, but not those to tensors made in inference mode: of these it is the content.
+    """
+    return hash(tensor.numpy(force=True).tobytes()) if tensor.is_inference() else tensor._version
+
+
 class Contents:
     """All that objects hold and lead to.
 
@@ -110,8 +118,10 @@ class Contents:
         classes = [kind for kind in dict.fromkeys(kinds) if kind is not object]
         self._users = [vars(kind) for kind in classes if is_users(kind)]
         self._library = [vars(kind) for kind in classes if not is_users(kind)]
-        self._changeable = [*walk.tensors, *walk.others]
+        found = [*walk.tensors, *walk.others]
+        self._changeable = [tensor for tensor in found if not tensor.is_inference()]
         self._versions = [tensor._version for tensor in self._changeable]
+        self._of_inference = [(tensor, version(tensor)) for tensor in found if tensor.is_inference()]
         self._sets = [(part, set(part)) for part in walk.sets]
         self._arrays = [(array, array.tobytes()) for array in walk.arrays]
         # Live views of all containers: what they lead to is compared at once, in ten microseconds a policy.
@@ -143,6 +153,7 @@ class Contents:
                 and not any(self._walk.empty)
                 and all(map(is_, self._look(), self._inside))
                 and [tensor._version for tensor in self._changeable] == self._versions
+                and all(version(tensor) == then for tensor, then in self._of_inference)
                 and all(now == then for now, then in self._sets)
                 and all(now.tobytes() == then for now, then in self._arrays)
                 and not (library and self.replaced(self._methods))

@@ -248,10 +248,11 @@ class Program(Derived):
             return None
         copies = self.copies or int(given.rows <= _FEW)
         key = given.key(), copies
-        if key not in self._compiled:
-            self._compiled[key] = self._again(key) or self._build(given, copies)
-        built = self._compiled[key]
-        return None if built is None or not self._alone(given) else built.compiled
+        with torch.device("cpu"):  # what the step makes is where its inputs are, not on a default device
+            if key not in self._compiled:
+                self._compiled[key] = self._again(key) or self._build(given, copies)
+            built = self._compiled[key]
+            return None if built is None or not self._alone(given) else built.compiled
 
     def _alone(self, given: Given) -> bool:
         """Return whether a user's step may be traced with a single row, by calls with one row and more."""

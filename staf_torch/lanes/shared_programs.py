@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from .contents import Contents
+from .contents import Contents, version
 from .program import Program
 from .trace.step import Step
 
@@ -93,7 +93,7 @@ class SharedPrograms:
         tensors = read.tensors
         if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
             return Program(step, name=self._name, compile=False)
-        versions = [tensor._version for tensor in tensors]
+        versions = [*map(version, tensors)]
         held = self._models.pop(read.key, None)
         if held is None or read.replaced(held.methods):
             new, signature = Program(step, name=self._name, copies=copies), read.signature()

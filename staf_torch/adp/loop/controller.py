@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from ...lanes.contents import is_users
+from ...lanes.contents import is_users, version
 from ...numerics.checks import copied, real
 from ...numerics.linalg import riccati
 from ...systems import Plant
@@ -161,8 +161,8 @@ class Feedback(Controller):
         before = _tensors_of(self.policy)
         with torch.no_grad():
             self.policy(x0)
-        for name, (tensor, version) in _tensors_of(self.policy).items():
-            if name not in before or tensor is not before[name][0] or version != before[name][1]:
+        for name, (tensor, written) in _tensors_of(self.policy).items():
+            if name not in before or tensor is not before[name][0] or written != before[name][1]:
                 raise ValueError(
                     f"`Feedback(policy=...)` must be a function of the state; a call of {self.label} changed "
                     f"its `{name}`. What has a memory is a `Controller`: `init` and `step` carry it by rows."
@@ -175,7 +175,7 @@ class Feedback(Controller):
 def _tensors_of(policy: Any) -> dict[str, tuple[Tensor, int]]:
     """The tensors that an object holds itself, and how often each was written to."""
     held = {**getattr(policy, "__dict__", {}), **getattr(policy, "_buffers", {})}
-    return {name: (x, x._version) for name, x in held.items() if isinstance(x, Tensor)}
+    return {name: (x, version(x)) for name, x in held.items() if isinstance(x, Tensor)}
 
 
 class LQR(nn.Module):

@@ -17,6 +17,8 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import _disable_current_modes
 
+from ..contents import version
+
 _NO_VALUES = """zeros_like ones_like full_like empty_like rand_like _new_zeros_with_same_feature_meta
     new_zeros new_ones new_full new_empty new_empty_strided lift_fresh lift_fresh_copy"""
 _OF_NO_VALUES = frozenset(_NO_VALUES.split())
@@ -189,7 +191,7 @@ class Captured:
             if not _in_memory(value):
                 return id(value)
             form = value.storage_offset(), value.stride(), value.shape, value.dtype
-            return (self._first(value), value._version, *form)
+            return (self._first(value), version(value), *form)
         if isinstance(value, list | tuple):
             return tuple(map(self._description, value))
         return type(value), value  # 1, 1.0 and True are equal
