@@ -34,7 +34,6 @@ _log = logging.getLogger(__name__)
 _DECAY = 2.0  # time constants of the slowest mode of the LQR in the horizon
 _PLANNED = 3.0  # likewise with plans, which need the end to be nearer to the goal
 _STEPS = (12, 60)  # periods in the horizon, at least and at most
-_RESOLVED = 0.2  # length of an integration step in time constants of the plant's fastest mode
 _SHARES = (0.25, 0.5, 1.0, 2.0, 4.0)  # of the spread: boxes of states that a report tries
 _TIMED, _TIMING = (20, 400), 1e5  # controls that are timed: at least, at most; us that are enough
 _SETTLED = 9.2  # time constants for which the loops of a report run: the slowest mode falls to 1e-4
@@ -64,14 +63,14 @@ class NearOptimal(SampledRollout):
         lqr: LQR,
         *,
         steps: int,
-        substeps: int,
+        substeps: int | None,
         radius: float,
         plan: bool,
     ) -> None:
         assert lqr.period is not None
         settings = {"period": lqr.period, "steps": steps, "substeps": substeps}
         super().__init__(basis, plant, lqr.cost, lqr, lqr.value, lqr.p, **settings)  # type: ignore[arg-type]
-        self.lqr, self.radius, self.substeps, self.plan = lqr, radius, substeps, plan
+        self.lqr, self.radius, self.substeps, self.plan = lqr, radius, self.holding.steps, plan
         self._planners: dict[Any, BoundedPlans] = {}  # each has programs, which take seconds
         self.memory: GlobalValue | None = None
         self.box = box_of(plant, lqr.cost.dim)
@@ -195,9 +194,7 @@ class NearOptimal(SampledRollout):
 
     def _run(self, controller: Controller, x0: Tensor) -> tuple[Tensor, Tensor]:
         """Cost until the slowest mode has decayed, and which rows were regulated."""
-        run = simulate(
-            controller, self.plant, self.cost, x0, dt=self.period, steps=self.settles, substeps=self.substeps
-        )
+        run = simulate(controller, self.plant, self.cost, x0, dt=self.period, steps=self.settles)
         return run.cost, arrived(self.cost, run.state[:, -1], x0) & ~run.diverged
 
     @property
@@ -244,6 +241,7 @@ def near_optimal(
     horizon: float | None = None,
     plan: bool = False,
     reach: str = "auto",
+    substeps: int | None = None,
 ) -> NearOptimal:
     """A policy for a plant, held for dt: never dearer than its LQR, and to the set-point from all of a box.
 
@@ -261,8 +259,8 @@ def near_optimal(
     **Local.** The rules: the base is the LQR made for dt; the horizon is two time constants of its slowest
     mode (three with plans), 12 to 60 periods, four quarters; 2 m + 1 centers lie along the m inputs, at
     ``radius`` from the state and on it, as `SampledRollout` says (with more inputs than states, around the
-    state as many as quadratics need); a plant in continuous time is integrated in steps of a fifth of its
-    fastest time constant.
+    state as many as quadratics need); a plant in continuous time is integrated to 1e-6 of its state, in
+    as many steps as that takes.
 
     Rollouts of an LQR do not know what to do before a bound of the inputs. Where the LQR, followed from x
     over the horizon, meets one (``report()`` says how often, ``strained``), the policy's ``controller()``,
@@ -299,6 +297,7 @@ def near_optimal(
             ``controller()``, and loops with it are compiled where that is asked for. Not with a global value.
         reach: ``auto`` for the rule above; ``local``: nobody looks how far the LQR leads; ``global``: the
             global value, also where the LQR would do.
+        substeps: integration steps a period of a plant in continuous time; None for as many as are accurate.
 
     Raises:
         ValueError: if an argument breaks its rule, the plant has no LQR, or ``reach`` is ``global`` and there
@@ -320,10 +319,6 @@ def near_optimal(
         steps = _periods(constants / _slowest(lqr, plant), period)
     else:
         steps = round(positive_real("near_optimal", "horizon", horizon) / period)
-    substeps = 1
-    if plant.period is None:
-        a, _ = plant.linearisation(placed.target, placed.target_input)
-        substeps = max(1, math.ceil(period * float(torch.linalg.eigvals(a).abs().max()) / _RESOLVED))
     corners = cross_polytope(placed.inputs)
     along = torch.cat((corners, torch.zeros_like(corners[:1])))
     directions = along if placed.inputs <= placed.dim else ball_directions(None, placed.dim)

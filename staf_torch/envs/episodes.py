@@ -182,7 +182,8 @@ class Episodes:
         if u.shape != wanted:
             raise fail("Episodes.step", "u", f"must have the shape {wanted}", tuple(u.shape))
         alive = torch.ones_like(self.age, dtype=torch.bool)
-        before = LoopState(self.state, self.state.new_zeros(len(u)), alive, self.age, u.to(self.state))
+        none = self.state.new_zeros(len(u))
+        before = LoopState(self.state, none, alive, self.age, none, none, u.to(self.state))
         with torch.no_grad():
             after, _ = self.loop(before, self.state.new_zeros(len(u), 0, self.state.shape[1]))
         self.state = after.x

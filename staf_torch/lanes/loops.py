@@ -17,6 +17,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 import torch
 from torch import Tensor
+from torch.utils._python_dispatch import _disable_current_modes
 
 from .trace.graph import FLAG, STEP, Ids, Loop
 from .trace.tracer import LARGE, NotLoweredError, Tracer
@@ -260,6 +261,17 @@ def tracing(tracer: Tracer) -> Iterator[None]:
         yield
     finally:
         _active.tracer = None
+
+
+@contextmanager
+def untraced() -> Iterator[None]:
+    """Compute with numbers of no row while a step is traced: nothing of it comes into the program."""
+    before, _active.tracer = getattr(_active, "tracer", None), None
+    try:
+        with _disable_current_modes():
+            yield
+    finally:
+        _active.tracer = before
 
 
 def tracing_now() -> bool:

@@ -11,7 +11,7 @@ from torch import Tensor
 from ...numerics.checks import non_negative, one_or_each, positive
 from ...numerics.linalg import row_jacobian
 from ...numerics.riccati import product
-from ...systems import runge_kutta_step
+from ..problem.held_plant import Holding
 from .least_squares import Estimate
 from .parametric import ParametricPlant
 
@@ -68,6 +68,7 @@ class ConsiderFilter:
     ) -> None:
         n = model._size()
         self.model = model
+        self._held: dict[float, Holding] = {}  # of every period
         self.noise = positive("ConsiderFilter", "noise", one_or_each("ConsiderFilter", "noise", noise, n))
         disturbed = one_or_each("ConsiderFilter", "process", process, n)
         self.process = non_negative("ConsiderFilter", "process", disturbed)
@@ -99,10 +100,11 @@ class ConsiderFilter:
         """
         theta = estimate.theta
         believed = self.model.believing(theta)
+        if dt not in self._held:
+            self._held[dt] = Holding("ConsiderFilter", self.model, None, dt, exponential=False)
+        held = self._held[dt]
         follows = (state.sensitivity * (theta - state.theta).unsqueeze(-2)).sum(-1)
-        mean, slope = row_jacobian(
-            lambda x: runge_kutta_step(lambda x: believed.motion(x, u), x, dt), state.mean + follows
-        )
+        mean, slope = row_jacobian(lambda x: held.of(believed)(x, u)[0], state.mean + follows)
         sensitivity = product(slope, state.sensitivity) + dt * self.model.regressor(state.mean + follows, u)
         own = product(product(slope, state.covariance), slope.mT)
         own = own + torch.diag(self.process.to(y).square() * dt)

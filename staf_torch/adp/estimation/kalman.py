@@ -14,9 +14,10 @@ from ...numerics.angles import periods_of, wrap_each
 from ...numerics.checks import fail, non_negative, one_or_each, positive, real, vector
 from ...numerics.linalg import row_jacobian
 from ...numerics.riccati import measured, product
-from ...systems import Plant, runge_kutta_step
+from ...systems import Plant
 from ..loop.controller import Carried, Controller
 from ..problem.cost import Output, matvec
+from ..problem.held_plant import Holding
 
 
 class Belief(NamedTuple):
@@ -60,6 +61,7 @@ class KalmanFilter(abc.ABC):
         if not noise or not all(real(name, "noise", s) > 0 for s in noise):
             raise fail(name, "noise", "must be positive numbers, one an output", noise)
         self.model, self.output = model, output
+        self._held: dict[float, Holding] = {}  # of every period
         self.noise = torch.tensor(noise, dtype=torch.float64)
         self.process = non_negative(name, "process", one_or_each(name, "process", process, n))
         seen = output(torch.zeros(1, n, dtype=torch.float64))
@@ -106,7 +108,9 @@ class KalmanFilter(abc.ABC):
         """x after dt seconds with u held: (..., n), (..., m) -> (..., n)."""
         if self.model.period is not None:
             return x + self.model.motion(x, u)
-        return runge_kutta_step(lambda x: self.model.motion(x, u), x, dt)
+        if dt not in self._held:
+            self._held[dt] = Holding(type(self).__name__, self.model, None, dt)
+        return self._held[dt](x, u)[0]
 
     def disturbance(self, like: Tensor, dt: float) -> Tensor:
         """The covariance that dt seconds add, (n, n)."""

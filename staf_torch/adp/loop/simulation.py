@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import math
 from collections.abc import Callable, Sequence
 
 import torch
@@ -12,17 +13,19 @@ from torch import Tensor
 from ...lanes import Program
 from ...lanes.compiled_methods import worth
 from ...lanes.tree import flatten, unflatten
-from ...numerics.checks import choice, fail, integer, trailing
+from ...numerics.checks import choice, copied, fail, integer, positive_real, trailing
 from ...systems import ControlAffineSystem, Plant
 from ..problem.cost import Cost
 from ..problem.held_linear import HeldLoop
-from ..problem.held_plant import fewest_and_most
+from ..problem.held_plant import RESOLVED, Holding, Substeps, fewest_and_most
+from .accuracy import BENT, largest_moves, needed, warn_of_errors
 from .controller import Carried, Controller, Feedback, Policy
-from .step import ClosedLoop, program, record, row_numbers
+from .step import ClosedLoop, LoopState, program, record, row_numbers
 
 _log = logging.getLogger(__name__)
 _DRAWN_AHEAD = 1024  # steps whose random numbers are drawn at once
 _NUMBERS = 1 << 24  # at most, of all rows together
+_EULER = 64  # rows of the published integrator that are checked
 _DT = 0.001  # s, where neither controller nor plant has a period
 _PAYS = (
     3000  # integration steps of a small batch in plain torch (some 1 ms each) that take as long as to compile
@@ -110,7 +113,7 @@ def simulate(
     every: int = 1,
     seed: int | Sequence[int] = 0,
     integrator: str = "runge_kutta",
-    substeps: int | tuple[int, int] = 1,
+    substeps: Substeps = None,
     renew: bool = False,
     limit: float = 1e6,
     compile: bool | str = "auto",
@@ -140,7 +143,9 @@ def simulate(
         steps: at least 1.
         every: steps from one recorded time to the next; divides ``steps``.
         seed: of the first row, the next row having the next; or one a row.
-        integrator: as in `ClosedLoop`, and so are ``substeps`` and ``renew``.
+        integrator: as in `ClosedLoop`, and so are ``substeps`` and ``renew``. By default a row whose plant
+            turns out to be too fast for its steps runs again with as many as it needs; what is left of errors
+            above 1e-5 of the state within a period, by this or by your own choice, is a warning in the log.
         limit: as in `ClosedLoop`.
         compile: whether the loop is compiled by `lanes`: True, False, or ``auto`` (where the run is long
             enough to pay for it, and never with a controller that improves plans: some seconds, once). What
@@ -160,30 +165,110 @@ def simulate(
     if steps % every:
         raise fail("simulate", "every", f"must divide the {steps} steps", every)
     choice("simulate", "compile", compile, (True, False, "auto"))
-    most = fewest_and_most("simulate", substeps)[1]
-    work = steps * (most + max(getattr(part, "work", 1.0) for part in controller.modules()) - 1)
-    pays = work * (1 + len(x0) / 200) >= _PAYS
+    if substeps is not None:
+        fewest_and_most("simulate", substeps)
     if dt is None:
         dt = controller.period or system.period or _DT
-    more = {"integrator": integrator, "substeps": substeps, "renew": renew, "limit": limit}
+    fastest = math.inf
+    if isinstance(controller, Feedback) and x0.device.type == "cpu":
+        controller.check(x0)
+        fastest = warn_if_unstable(controller.policy, system, cost, positive_real("simulate", "dt", dt))
+    # Of slow plants one step is tried, as rows that are fast elsewhere run again.
+    tried = 1 if substeps is None and fastest * dt <= RESOLVED else substeps
+    holding = None
+    if tried is not substeps:
+        holding = Holding("simulate", system, cost, dt, 1)
+    more = {
+        "integrator": integrator,
+        "substeps": substeps,
+        "renew": renew,
+        "limit": limit,
+        "holding": holding,
+    }
     loop = ClosedLoop(controller, system, cost, dt=dt, **more)  # type: ignore[arg-type]
     loop.to(x0.device)
-    if isinstance(controller, Feedback):
+    if isinstance(controller, Feedback) and x0.device.type != "cpu":
         controller.check(x0)
-    if isinstance(controller, Feedback) and x0.device.type == "cpu":
-        warn_if_unstable(controller.policy, system, cost, dt)
-    pays = pays and not any(getattr(part, "costly", False) for part in controller.modules())
-    compiled = (worth(pays) if compile == "auto" else bool(compile)) and system.traceable
+    whole = _Run(x0, steps, every, _seeds(seed, len(x0)), compile, progress)
     with torch.no_grad():
-        return _run(loop, program(loop, compiled), x0, steps, every, _seeds(seed, len(x0)), progress)
+        result, last = whole.of(loop)
+        strained = ~(last.bent <= BENT * last.reach) & torch.isfinite(last.reach)
+        if integrator == "euler" and system.period is None:
+            strained[:_EULER] = True
+        if not bool(strained.any()):
+            return result
+        return whole.checked(loop, result, strained, substeps is None and integrator != "euler")
 
 
-def warn_if_unstable(policy: Policy, system: Plant, cost: Cost, dt: float) -> None:
-    """Say in the log that the linearised loop of a policy held for dt is not stable, and which period is."""
+@dataclasses.dataclass(frozen=True)
+class _Run:
+    """What `simulate` runs, again for some rows with other steps."""
+
+    x0: Tensor
+    steps: int
+    every: int
+    seeds: Sequence[int]
+    compile: bool | str
+    progress: Callable[[int], None] | None
+
+    def of(self, loop: ClosedLoop) -> tuple[LoopResult, LoopState]:
+        """The result of a loop and its last state."""
+        parts = list(loop.controller.modules())
+        work = self.steps * (loop.holding.steps + max(getattr(part, "work", 1.0) for part in parts) - 1)
+        pays = work * (1 + len(self.x0) / 200) >= _PAYS
+        pays = pays and not any(getattr(part, "costly", False) for part in parts)
+        compiled = (worth(pays) if self.compile == "auto" else bool(self.compile)) and loop.system.traceable
+        ran = program(loop, compiled)
+        return _run(loop, ran, self.x0, self.steps, self.every, self.seeds, self.progress)
+
+    def checked(self, loop: ClosedLoop, result: LoopResult, rows: Tensor, again: bool) -> LoopResult:
+        """Return the result in which the rows of a mask (B,) that need more steps took them, if they may run
+        ``again``; warn of those that are wrong by more than a little."""
+        rest, at = loop.system.resting_input(), rows.nonzero().squeeze(1)
+        frozen = result.diverged[at]
+        moves = largest_moves(result.state[at], result.control[at], rest, frozen)
+        found = needed(loop.holding, *moves, frozen)
+        if not again:
+            one = needed(loop.holding, *moves, torch.ones_like(frozen), most=1)
+            warn_of_errors(loop.holding, at, one, "Leave `substeps` and `integrator` as they are by default.")
+            return result
+        for factor in found.factor.unique().tolist():
+            if factor == 1:
+                continue
+            finer = copied(loop)
+            finer.holding = loop.holding.finer(factor)
+            chosen = at[(found.factor == factor).to(at.device)]
+            result = self._replaced(result, finer, chosen)
+        warn_of_errors(loop.holding, at, found, "A shorter dt would do.")
+        return result
+
+    def _replaced(self, result: LoopResult, loop: ClosedLoop, rows: Tensor) -> LoopResult:
+        """Return the result with these rows (R,) of another loop."""
+        alone = not row_numbers(loop)  # else a controller has numbers of all rows
+        some = dataclasses.replace(self, progress=None)
+        if alone:
+            seeds = [self.seeds[row] for row in rows.tolist()]
+            some = dataclasses.replace(some, x0=self.x0[rows], seeds=seeds)
+        other, _ = some.of(loop)
+        fields = [field.name for field in dataclasses.fields(result) if field.name != "time"]
+        kept, structure = flatten([getattr(result, name) for name in fields])
+        new = flatten([getattr(other, name) for name in fields])[0]
+        pairs = zip(kept, new, strict=True)
+        whole = [old.index_copy(0, rows, fresh if alone else fresh[rows]) for old, fresh in pairs]
+        return LoopResult(result.time, *unflatten(structure, iter(whole)))
+
+
+def warn_if_unstable(policy: Policy, system: Plant, cost: Cost, dt: float) -> float:
+    """Say in the log that the linearised loop of a policy held for dt is not stable, and which period is.
+
+    Returns:
+        The fastest mode of the linearised plant without control, 1/s; inf where it is not known.
+    """
     held = HeldLoop.of(policy, system, at=cost.set_point())
     radius = held.spectral_radius(dt)
+    fastest = float(torch.linalg.eigvals(held.f).abs().max()) if held.finite else math.inf
     if not radius >= 1:
-        return
+        return fastest
     most = held.largest_period()
     remedy = "at no period" if most is None else f"up to {most:.4g} s"
     _log.warning(
@@ -191,6 +276,7 @@ def warn_if_unstable(policy: Policy, system: Plant, cost: Cost, dt: float) -> No
         "is unstable; it is stable %s. `LQR(plant, cost, period=dt)` is made to be held.",
         *(dt, radius, remedy),
     )
+    return fastest
 
 
 def _run(
@@ -201,7 +287,7 @@ def _run(
     every: int,
     seeds: Sequence[int],
     progress: Callable[[int], None] | None,
-) -> LoopResult:
+) -> tuple[LoopResult, LoopState]:
     state = loop.init(x0)
     pieces: list[list[Tensor]] = []
     draws, done, numbers = loop.controller.draws, 0, row_numbers(loop)
@@ -223,7 +309,8 @@ def _run(
     kept = unflatten(structure, (torch.cat(column, dim=1) for column in zip(*pieces, strict=True)))
     time = torch.arange(0, steps + 1, every, dtype=torch.float64) * loop.dt
     frozen_at = torch.where(state.alive, torch.inf, state.lived * loop.dt)
-    return LoopResult(time, kept.x, kept.u, kept.cost, kept.recorded, frozen_at, state.carried)
+    result = LoopResult(time, kept.x, kept.u, kept.cost, kept.recorded, frozen_at, state.carried)
+    return result, state
 
 
 def _seeds(seed: int | Sequence[int], batch: int) -> Sequence[int]:

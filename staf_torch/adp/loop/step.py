@@ -16,7 +16,7 @@ from ...numerics.angles import wrap
 from ...numerics.checks import choice, copied, fail, flag, positive_real
 from ...systems import Plant
 from ..problem.cost import Cost
-from ..problem.held_plant import Holding, fewest_and_most
+from ..problem.held_plant import Holding, Substeps
 from .controller import Carried, Controller, Feedback
 
 
@@ -27,6 +27,8 @@ class LoopState(NamedTuple):
     cost: Tensor  # (B,) the integral of the cost rate so far
     alive: Tensor  # (B,) bool; a row that became non-finite keeps its last finite values
     lived: Tensor  # (B,) steps taken alive
+    bent: Tensor  # (B,) of `Holding.watched`, the largest so far
+    reach: Tensor  # (B,) the largest coordinate of a state so far
     carried: Carried
 
 
@@ -41,12 +43,14 @@ class ClosedLoop(nn.Module):
         dt: s.
         integrator: of the plant over a step, ``runge_kutta`` (fourth order) or ``euler`` (as published). A
             plant in discrete time takes its own steps.
-        substeps: Runge-Kutta steps while the control is held, at least 1; of a plant with a
-            `Plant.step_limit` each row has lengths of its own, and of two numbers, (1, 16), it takes the
-            first where no limit is met, the second at most.
+        substeps: Runge-Kutta steps while the control is held, at least 1; None for as many as are accurate to
+            1e-6 of the state, as `Holding` chooses them. Of a plant with a `Plant.step_limit` each row has
+            lengths of its own, and of two numbers, (1, 16), it takes the first where no limit is met, the
+            second at most.
         renew: whether the control follows the state at every substep, in place of being held for dt. Of
             feedback laws alone.
         limit: a row whose state, its angles in [-pi, pi], exceeds it in norm has diverged.
+        holding: in place of one with these ``substeps``.
 
     Raises:
         ValueError: if an argument breaks its rule.
@@ -60,22 +64,25 @@ class ClosedLoop(nn.Module):
         *,
         dt: float,
         integrator: str = "runge_kutta",
-        substeps: int | tuple[int, int] = 1,
+        substeps: Substeps = None,
         renew: bool = False,
         limit: float = 1e6,
+        holding: Holding | None = None,
     ) -> None:
         super().__init__()
         choice("ClosedLoop", "integrator", integrator, ("runge_kutta", "euler"))
         self.controller, self.system, self.cost = controller, system, cost.around(system)
         self.dt = positive_real("ClosedLoop", "dt", dt)
-        self.substeps = fewest_and_most("ClosedLoop", substeps)[1]
         self.limit = positive_real("ClosedLoop", "limit", limit)
         self.renew = flag("ClosedLoop", "renew", renew)
         if self.renew and (not isinstance(controller, Feedback) or system.period is not None):
             rule = "needs a feedback law and a plant in continuous time"
             raise fail("ClosedLoop", "renew", rule, controller.label)
         self.euler = integrator == "euler" and system.period is None
-        self.holding = Holding("ClosedLoop", system, self.cost, self.dt, substeps)
+        if holding is None:
+            first = 1 if self.euler else substeps
+            holding = Holding("ClosedLoop", system, self.cost, self.dt, first, exponential=not self.renew)
+        self.holding = holding
 
     def with_numbers(self, numbers: Mapping[str, Any]) -> Self:
         """Return a copy whose controller has other numbers: `Controller.with_numbers`."""
@@ -94,7 +101,7 @@ class ClosedLoop(nn.Module):
                     f"`{type(self.controller).__name__}.init` must return tensors (B, ...), here with "
                     f"B = {x0.shape[0]}; got one of {tuple(part.shape)}."
                 )
-        return LoopState(x0, zeros, alive, zeros.clone(), carried)
+        return LoopState(x0, zeros, alive, *(zeros.clone() for _ in range(3)), carried)
 
     def forward(self, state: LoopState, uniform: Tensor) -> tuple[LoopState, Tensor]:
         """The state after dt seconds, and the control held until then, (B, m)."""
@@ -106,7 +113,7 @@ class ClosedLoop(nn.Module):
                 f"got {tuple(u.shape)}."
             )
         u = self.cost.admissible(u)
-        x, spent = self._advance(state.x, u)
+        x, spent, bent = self._advance(state.x, u)
         size = wrap(x, self.system.periodic).square().sum(-1)  # an angle may turn as often as it likes
         good = torch.isfinite(spent) & (size <= self.limit**2)
         parts, before = flatten(carried), flatten(state.carried)
@@ -124,16 +131,19 @@ class ClosedLoop(nn.Module):
         if self.cost.discount:
             spent = spent * torch.exp(-self.cost.discount * self.dt * state.lived)
         cost = state.cost + torch.where(alive, spent, 0.0)
-        return LoopState(_where(alive, x, state.x), cost, alive, state.lived + alive, kept), u
+        bent = torch.where(state.alive & ~(bent <= state.bent), bent, state.bent)  # also what is not a number
+        reach = torch.maximum(state.reach, state.x.abs().amax(-1))
+        return LoopState(_where(alive, x, state.x), cost, alive, state.lived + alive, bent, reach, kept), u
 
-    def _advance(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-        """The state after dt with u held, and the cost until then."""
+    def _advance(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The state after dt with u held, the cost until then, and how much the rate bends."""
         if self.euler:
-            return x + self.dt * self.system.motion(x, u), self.dt * self.cost.rate(x, u)
+            paid = self.dt * self.cost.rate(x, u)
+            return x + self.dt * self.system.motion(x, u), paid, torch.zeros_like(paid)
         if self.renew and isinstance(self.controller, Feedback):
             policy = self.controller.policy
-            return self.holding(x, u, lambda at: self.cost.admissible(policy(at)))
-        return self.holding(x, u)
+            return self.holding.watched(x, u, lambda at: self.cost.admissible(policy(at)))
+        return self.holding.watched(x, u)
 
 
 def _where(alive: Tensor, new: Tensor, old: Tensor) -> Tensor:

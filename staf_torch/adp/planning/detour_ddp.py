@@ -14,9 +14,9 @@ from ...numerics.checks import fail, integer, positive_real
 from ...numerics.forward_mode import use_forward_mode
 from ...numerics.linalg import row_jacobian
 from ...numerics.riccati import product, riccati_step
-from ...numerics.runge_kutta import runge_kutta_step
 from ..loop.controller import Controller
 from ..problem.cost import QuadraticCost, matvec
+from ..problem.held_plant import Holding
 from .detour_rollout import DetourRollout
 
 _TRIES, _SHORTER = 6, 0.3  # lengths of a step that are tried, each this share of the one before
@@ -51,6 +51,7 @@ class PlanProblem:
     def __init__(self, detours: DetourRollout, cost: QuadraticCost, moved: int, weight: float) -> None:
         self.detours, self.plant, self.cost = detours, detours.plant, cost
         self.hold, self.steps = detours.hold, detours.steps
+        self.holding = Holding("DetourDDP", self.plant, None, self.hold)
         self.moved, self.weight = moved, weight
 
     def improve(self, now: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
@@ -128,9 +129,8 @@ class PlanProblem:
         return self._advance(self.whole(y, others), u)[..., : self.moved]
 
     def _advance(self, x: Tensor, u: Tensor) -> Tensor:
-        """x after a period: one Runge-Kutta step."""
-        plant = self.plant
-        return runge_kutta_step(lambda at: plant.velocity(at, u), x, self.hold, plant.displaced)
+        """x after a period."""
+        return self.holding(x, u)[0]
 
     def bounds(self, like: Tensor) -> tuple[Tensor, Tensor]:
         """(m,) each; infinite where there are none."""

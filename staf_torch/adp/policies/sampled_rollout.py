@@ -72,7 +72,8 @@ class SampledRollout(nn.Module):
         metric: P, (n, n), positive semidefinite, of the step's length: that of the LQR.
         period: s, for which a control is held.
         steps: periods in the horizon, at least 4.
-        substeps: integration steps a period of a plant in continuous time.
+        substeps: integration steps a period of a plant in continuous time; None for as many as `Holding`
+            finds necessary.
 
     Raises:
         ValueError: if an argument breaks its rule.
@@ -92,7 +93,7 @@ class SampledRollout(nn.Module):
         *,
         period: float,
         steps: int = 20,
-        substeps: int = 1,
+        substeps: int | None = None,
     ) -> None:
         super().__init__()
         cost = cost.around(plant)
@@ -104,7 +105,7 @@ class SampledRollout(nn.Module):
         self.basis, self.plant, self.cost, self.base, self.terminal = basis, plant, cost, base, terminal
         self.period = positive_real("SampledRollout", "period", period)
         self.steps = integer("SampledRollout", "steps", steps, least=4)
-        self.holding = Holding("SampledRollout", plant, cost, self.period, substeps)
+        self.holding = Holding("SampledRollout", plant, cost, self.period, substeps).checked()
         self.register_buffer("metric", metric.double())
         self.metric: Tensor
         self.bounds = Bounds(None, None, cost.inputs) if cost.bounds is None else cost.bounds

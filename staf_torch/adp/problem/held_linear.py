@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ...numerics.checks import fail, positive_real
 from ...numerics.differences import STEP, central_slopes
+from ...numerics.exponential_step import quadratic_integral
 from ...numerics.linalg import check_modes, discrete_riccati, exponential, unstabilisable_mode
 from ...systems import Clocked, Plant
 from .cost import Cost
@@ -35,8 +36,6 @@ class Hold(NamedTuple):
 def exact_hold(f: Tensor, g: Tensor, q: Tensor, r: Tensor, period: float, *, discount: float = 0.0) -> Hold:
     """Return x' = F x + G u and the integral of x'Qx + u'Ru over one period with u held.
 
-    The exponential of a short step is doubled: e^(M 2h) = (e^(M h))^2, W(2h) = W(h) + e^(M h)' W(h) e^(M h).
-
     Args:
         f: F, (n, n), in 1/s.
         g: G, (n, m).
@@ -47,26 +46,15 @@ def exact_hold(f: Tensor, g: Tensor, q: Tensor, r: Tensor, period: float, *, dis
 
     Raises:
         ValueError: if the period is not positive.
-
-    Source: Van Loan, "Computing integrals involving the matrix exponential", IEEE TAC 23 (1978).
     """
     positive_real("exact_hold", "period", period)
     n, m = g.shape
     whole = torch.zeros(n + m, n + m, dtype=torch.float64)
     whole[:n, :n], whole[:n, n:] = f, g
     whole = whole - 0.5 * discount * torch.eye(n + m, dtype=torch.float64)
-    length = float(torch.linalg.matrix_norm(whole, 1)) * period
-    doublings = max(0, 2 + math.ceil(math.log2(max(length, 1e-9))))
-    h = period / 2**doublings
     rate = torch.block_diag(q.double(), r.double())
-    rows = torch.cat((-whole.mT, rate), dim=1), torch.cat((torch.zeros_like(whole), whole), dim=1)
-    step = exponential(h * torch.cat(rows))
-    flow = step[n + m :, n + m :]
-    paid = flow.mT @ step[: n + m, n + m :]
-    for _ in range(doublings):
-        paid = paid + flow.mT @ paid @ flow
-        flow = flow @ flow
-    return Hold(flow[:n, :n], flow[:n, n:], 0.5 * (paid + paid.mT))
+    flow, paid = quadratic_integral(whole, rate, period)
+    return Hold(flow[:n, :n], flow[:n, n:], paid)
 
 
 def periods(call: str, plant: Plant, dt: float) -> int:

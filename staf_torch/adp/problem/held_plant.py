@@ -2,17 +2,43 @@
 
 from __future__ import annotations
 
+import copy
+import logging
 import math
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from ...lanes import repeat, scan
+from ...lanes.loops import untraced
 from ...numerics.checks import integer, positive_real
+from ...numerics.exponential_step import (
+    ExponentialStep,
+    StepCount,
+    exponential_stages,
+    exponential_step,
+    fewest_steps,
+    times,
+)
 from ...systems import Clocked, Plant, StepPlant
 from .cost import Cost
 from .held_linear import periods
+from .tracking_cost import TrackingCost
+
+_log = logging.getLogger(__name__)
+TOLERANCE = 1e-6  # error of a hold, relative to the state
+RESOLVED = 0.2  # of the time constant of the fastest mode, that one classical step may take: 3e-6 in error
+GRACE = 10.0  # times the tolerance: more steps are tried, and what is left above it is a warning
+_OUTSIDE = 100.0  # likewise in a few states far out
+_MOST = 1024  # substeps that are chosen at most
+_SAMPLES, _SHARE = 24, 0.8  # states; the share that one step must serve, as it nearly must all
+_MOVED = 0.1  # of the spread, in a hold, by inputs without bounds
+_DEARER = 1.5  # work of an exponential step, in classical ones
+_LEAST = 1e-6  # of a state, below which errors are absolute
+_PAID = 0.1  # weight of the cost's error beside the state's
+Substeps = int | tuple[int, int] | None
 
 
 def fewest_and_most(call: str, substeps: int | tuple[int, int]) -> tuple[int, int]:
@@ -33,32 +59,61 @@ RungeKuttaSums = tuple[Tensor, Tensor, Tensor]
 
 
 class Holding:
-    """x+ and the cost over ``dt`` seconds with u held.
+    """x+ and the cost over ``dt`` seconds with u held: what simulators, designers and filters share.
 
-    A plant in continuous time is integrated by Runge-Kutta steps of fourth order, and its cost rate with it;
-    one in discrete time takes its steps, each of which pays its period times the cost rate at its start.
+    A plant in continuous time is integrated in equal steps of fourth order, and its cost rate with it: one
+    classical Runge-Kutta step where it takes a fifth of the fastest time constant at most and its error is
+    some 1e-6 of the state, else more of them or exponential
+    steps around the linearisation, which solve its fast modes exactly: what is less work. A linear plant with
+    a quadratic cost takes one exponential step, which is exact. The number is chosen once, by step doubling
+    on states around the set-point (within the plant's ``spread``) and inputs within the bounds.
+    A plant in discrete time takes its own steps, each of which pays its period times the cost rate at its
+    start.
 
     Args:
         call: whose argument ``dt`` is, for messages.
         plant: the plant.
-        cost: the cost rate, around the plant.
+        cost: the cost rate, around the plant; None where nothing is paid.
         dt: s; of a plant in discrete time a multiple of its period.
-        substeps: integration steps, at least 1; not for a plant in discrete time. Where the plant has a
-            `Plant.step_limit` the first of them are no longer than that, and the last takes the rest. Two
-            numbers: of such a plant the least where no limit is met, and the most.
+        substeps: classical steps, at least 1; None for the rule above. Not for a plant in discrete time.
+            Where the plant has a `Plant.step_limit` the first of them are no longer than that, and the last
+            takes the rest. Two numbers: of such a plant the least where no limit is met, and the most.
+        exponential: whether exponential steps may be chosen.
+
+    Attributes:
+        steps: integration steps of a hold, at most.
+        error: relative error of a hold by step doubling, on the samples; None where nothing was chosen.
 
     Raises:
         ValueError: if ``dt`` is not positive, or no multiple of the plant's period.
     """
 
     def __init__(
-        self, call: str, plant: Plant, cost: Cost, dt: float, substeps: int | tuple[int, int] = 1
+        self,
+        call: str,
+        plant: Plant,
+        cost: Cost | None,
+        dt: float,
+        substeps: Substeps = None,
+        *,
+        exponential: bool = True,
     ) -> None:
-        self.plant, self.cost = plant, cost
+        self.call, self.plant, self.cost = call, plant, cost
         self.dt = positive_real(call, "dt", dt)
-        least, most = fewest_and_most(call, substeps)
-        self.least = least
-        self.steps = most if plant.period is None else periods(call, plant, dt)
+        self.least, self.steps = fewest_and_most(call, 1 if substeps is None else substeps)
+        self.table: ExponentialStep | None = None
+        self.discount = 0.0 if cost is None else cost.discount
+        self.error: float | None = None
+        if plant.period is not None:
+            self.least = self.steps = periods(call, plant, dt)
+        elif substeps is None:
+            with untraced(), torch.no_grad():  # a filter may ask for it in its first step
+                self._choose(exponential)
+
+    @property
+    def classical(self) -> bool:
+        """True where a hold is one classical Runge-Kutta step of a state that steps are added to."""
+        return self.steps == 1 and self.table is None and self.plant.period is None and _adds(self.plant)
 
     def __call__(
         self, x: Tensor, u: Tensor, renewed: Callable[[Tensor], Tensor] | None = None
@@ -70,62 +125,251 @@ class Holding:
             u: (..., m).
             renewed: u from x, asked again before every further substep; None where u is held.
         """
+        after, spent, *_ = self._hold(x, u, renewed, watch=False)
+        return after, spent
+
+    def watched(
+        self, x: Tensor, u: Tensor, renewed: Callable[[Tensor], Tensor] | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """`__call__`, and how much the rate bends within a substep: h |k_3 - k_2|, the largest, (...).
+
+        It grows as (h / tau)^3 with the fastest mode that moves, and costs no call of the plant.
+        """
+        after, spent, *bent = self._hold(x, u, renewed, watch=True)
+        return after, spent, bent[0] if bent else torch.zeros_like(spent)
+
+    def of(self, plant: Plant) -> Holding:
+        """Return a copy for a plant that differs from this in numbers."""
+        other = copy.copy(self)
+        other.plant = plant
+        return other
+
+    def checked(self) -> Holding:
+        """Return this, with a warning in the log where steps that somebody chose are too few."""
+        if self.error is None and self.plant.period is None:
+            x, u = self._samples()
+            found = self.errors(x, u)
+            if len(found) and not float(found.max()) <= GRACE * TOLERANCE:
+                _log.warning(
+                    "%s: with %d integration steps a period of %.4g s the next state is wrong by up to %.2g "
+                    "of its size; leave `substeps` away for %.0e.",
+                    *(self.call, self.steps, self.dt, float(found.max()), TOLERANCE),
+                )
+        return self
+
+    def finer(self, factor: int) -> Holding:
+        """Return a copy with so many times the steps."""
+        other = copy.copy(self)
+        other.steps, other.least = factor * self.steps, factor * self.least
+        if self.table is not None:
+            other.table = self._table(self.table.linear, other.steps)
+        return other
+
+    def _hold(
+        self, x: Tensor, u: Tensor, renewed: Callable[[Tensor], Tensor] | None, watch: bool
+    ) -> tuple[Tensor, ...]:
         if self.steps > 1 and (renewed is not None or self.plant.step_limit(x, u) is not None):
             return self._limited(x, u, renewed)
         length = self.dt / self.steps
-        spent = torch.zeros_like(x[..., 0])
-        share = 1.0
-        for _ in range(self.steps):
-            x, paid = self._step(x, u, length)
-            spent = spent + share * paid if self.steps > 1 else paid
-            share *= math.exp(-self.cost.discount * length)
-        return x, spent
+        if self.steps == 1:
+            return self._step(x, u, length, watch)
+        decay, zero = math.exp(-self.discount * length), torch.zeros_like(x[..., 0])
+
+        def substep(now: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+            x, spent, share, most = now
+            after, paid, *bent = self._step(x, u, length, watch)
+            spent = spent + share * paid if self.discount else spent + paid
+            return after, spent, decay * share, torch.maximum(most, bent[0]) if bent else most
+
+        x, spent, _, most = repeat(self.steps, substep, (x, zero, zero + 1.0, zero))
+        return x, spent, most
 
     def _limited(
         self, x: Tensor, u: Tensor, renewed: Callable[[Tensor], Tensor] | None
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Tensor, ...]:
         """Substeps of a row's own lengths."""
         none = torch.zeros_like(x[..., 0])
         longest = none + self.dt / self.least
         equal = self.least == self.steps
 
         def substep(now: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-            x, u, spent, left, count = now
+            x, u, spent, left, count, most = now
             length = left / count if equal else torch.minimum(left, longest)
             limit = self.plant.step_limit(x, u)
             if limit is not None:
                 length = torch.where(limit < length, limit, length)
             length = torch.where(count > 1, length, left)
-            after, paid = runge_kutta_held(self.plant, self.cost, x, u, length)
-            if self.cost.discount:
-                paid = paid * torch.exp(-self.cost.discount * (self.dt - left))
-            return after, u, spent + paid, left - length, count - 1
+            after, paid, bent = self._classical(x, u, length, watch=True)
+            if self.discount:
+                paid = paid * torch.exp(-self.discount * (self.dt - left))
+            return after, u, spent + paid, left - length, count - 1, torch.maximum(most, bent)
 
         def further(now: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
             return substep(now if renewed is None else (now[0], renewed(now[0]), *now[2:]))
 
-        first = substep((x, u, none, none + self.dt, none + self.steps))
+        first = substep((x, u, none, none + self.dt, none + self.steps, none))
         some = None if equal else (lambda now: now[3] > 0)
-        x, _, spent, _, _ = repeat(self.steps - 1, further, first, where=some)
-        return x, spent
+        x, _, spent, _, _, most = repeat(self.steps - 1, further, first, where=some)
+        return x, spent, most
 
-    def _step(self, x: Tensor, u: Tensor, h: float) -> tuple[Tensor, Tensor]:
+    def _step(self, x: Tensor, u: Tensor, h: float, watch: bool) -> tuple[Tensor, ...]:
         if self.plant.period is not None:
             assert isinstance(self.plant, StepPlant | Clocked)
-            return self.plant.step(x, u), h * self.cost.rate(x, u)
-        return runge_kutta_held(self.plant, self.cost, x, u, h)
+            paid = torch.zeros_like(x[..., 0]) if self.cost is None else h * self.cost.rate(x, u)
+            return self.plant.step(x, u), paid
+        return self._classical(x, u, h, watch) if self.table is None else self._exponential(x, u, h, watch)
+
+    def _classical(self, x: Tensor, u: Tensor, h: float | Tensor, watch: bool) -> tuple[Tensor, ...]:
+        """x+, what is paid, and `watched`'s number where it is wanted."""
+        plant, cost = self.plant, self.cost
+        none = torch.zeros_like(x[..., 0]) if cost is None else cost.input_rate(u)
+
+        def field(at: Tensor) -> tuple[Tensor, Tensor]:
+            return plant.velocity(at, u), none if cost is None else none + cost.state_rate(at)
+
+        return runge_kutta_loop(plant, field, x, h, self.discount, watch)
+
+    def _exponential(self, x: Tensor, u: Tensor, h: float, watch: bool) -> tuple[Tensor, ...]:
+        plant, cost, table, none = self.plant, self.cost, self.table, torch.zeros_like(x[..., 0])
+        assert table is not None
+        begun = torch.zeros_like(x) if table.paid is None or cost is None else cost.deviation(x)
+        curvature = None if cost is None or table.paid is None else cost.state_curvature().to(x)
+        plain = cost is None or (table.paid is not None and cost.output is None and not cost.periodic)
+
+        def field(away: Tensor) -> tuple[Tensor, Tensor]:
+            at = x + away
+            if cost is None or plain:
+                return plant.motion(at, u), none
+            rate = cost.state_rate(at)
+            return plant.motion(at, u), rate if curvature is None else rate - _square(curvature, begun + away)
+
+        moved, rests, rates = exponential_stages(table, field, x)
+        paid = none
+        if cost is not None:
+            shares = _shares(h, self.discount, x)[2]
+            whole = h if not self.discount else -math.expm1(-self.discount * h) / self.discount
+            paid = whole * cost.input_rate(u)
+            if not plain:
+                paid = paid + (shares.reshape(-1, *[1] * none.dim()) * rates).sum(0)
+            if table.paid is not None:
+                seen = torch.cat((begun, rests[0], 0.5 * (rests[1] + rests[2]), rests[3]), dim=-1)
+                paid = paid + _square(table.paid.to(x), seen)
+        after = plant.displaced(x, moved)
+        return (after, paid, h * (rests[2] - rests[1]).abs().amax(-1)) if watch else (after, paid)
+
+    def _table(self, linear: Tensor, steps: int) -> ExponentialStep:
+        cost = self.cost
+        curvature = None if cost is None or isinstance(cost, TrackingCost) else cost.state_curvature()
+        return exponential_step(linear, self.dt / steps, curvature, 0.0 if cost is None else cost.discount)
+
+    def _choose(self, exponential: bool) -> None:
+        """Choose the kind of the steps and their number."""
+        x, u = self._samples()
+
+        def errors(linear: Tensor | None) -> Callable[[int], Tensor]:
+            return lambda count: self._with(count, linear).errors(x, u)
+
+        one, linear = errors(None)(1), self._linearisation()
+        found = StepCount(1, float(one.max()) if len(one) else 0.0)
+        usual = float(one.quantile(_SHARE, interpolation="lower")) if len(one) else 0.0
+        slow = linear is None or float(torch.linalg.eigvals(linear).abs().max()) * self.dt <= RESOLVED
+        if not slow or usual > GRACE * TOLERANCE or found.error > _OUTSIDE * TOLERANCE:
+            if not (exponential and _adds(self.plant)):
+                linear = None
+            dear = StepCount(_MOST, math.inf)
+            if linear is not None:
+                dear = fewest_steps(errors(linear), TOLERANCE, _MOST)
+            most = _MOST if dear.error > TOLERANCE else min(_MOST, math.ceil(_DEARER * dear.count))
+            found = fewest_steps(errors(None), TOLERANCE, most)
+            cheaper = found.error <= TOLERANCE and found.count <= _DEARER * dear.count
+            if not cheaper and dear.error < found.error:
+                found, self.table = dear, self._with(dear.count, linear).table
+        self.least, self.steps, self.error = found.count, found.count, found.error
+        if not found.error <= (_OUTSIDE if found.count == 1 and self.table is None else GRACE) * TOLERANCE:
+            _log.warning(
+                "%s: with %d integration steps a period of %.4g s the next state is wrong by %.2g of its "
+                "size (wanted: %.0e): the rate is too fast for this dt, or has corners.",
+                *(self.call, found.count, self.dt, found.error, TOLERANCE),
+            )
+
+    def _with(self, count: int, linear: Tensor | None) -> Holding:
+        """Return a copy with other steps."""
+        other = copy.copy(self)
+        other.least = other.steps = count
+        other.table = None if linear is None else self._table(linear, count)
+        return other
+
+    def errors(self, x: Tensor, u: Tensor) -> Tensor:
+        """Return the error of holds, relative to state and cost: (P, n), (P, m) -> (P,); inf where something
+        is not finite."""
+        (wrong, size), (off, due) = self.doubled(x, u)
+        found = torch.maximum(wrong / size, _PAID * off / due)
+        return found.nan_to_num(math.inf, math.inf)
+
+    @torch.no_grad()
+    def doubled(self, x: Tensor, u: Tensor) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
+        """Return what twice the steps change of holds, and what that is compared with: of the state, (P,)
+        each, and of the cost."""
+        (after, paid), (better, due) = self(x, u), self.finer(2)(x, u)
+        rest = self._rest().to(x)
+        size = torch.maximum((x - rest).abs().amax(-1), (better - rest).abs().amax(-1))
+        least = _LEAST * (1 + float(rest.abs().max()))
+        rate = due.abs() if self.cost is None else self.dt * self.cost.rate(x, u).abs() + due.abs()
+        wrong = (after - better).abs().amax(-1)
+        return (wrong, size.clamp(min=least)), ((paid - due).abs(), rate.clamp(min=least**2))
+
+    def _rest(self) -> Tensor:
+        """The set-point, (n,)."""
+        if self.cost is None or self.cost.target is None:
+            return (
+                self.plant.equilibrium()
+                if self.plant.dim or self.cost is None
+                else torch.zeros(self.cost.dim)
+            )
+        return self.cost.target
+
+    def _linearisation(self) -> Tensor | None:
+        at = None if self.cost is None else self.cost.target
+        found = self.plant.linearisation(at, None if at is None else self.cost.target_input).matrix.double()
+        return found if bool(torch.isfinite(found).all()) else None
+
+    def _samples(self) -> tuple[Tensor, Tensor]:
+        """States around the set-point and inputs, (P, n) and (P, m), at which the plant moves."""
+        plant, cost, rest = self.plant, self.cost, self._rest().double()
+        generator = torch.Generator().manual_seed(0)
+        x = 2 * torch.rand(_SAMPLES, len(rest), dtype=torch.float64, generator=generator) - 1
+        x = rest + plant.spread * (x.abs() if isinstance(plant, Clocked) else x)
+        still = (
+            plant.resting_input().double() if cost is None or cost.target_input is None else cost.target_input
+        )
+        u = still.expand(_SAMPLES, -1)
+        chance = torch.rand(_SAMPLES, u.shape[-1], dtype=torch.float64, generator=generator)
+        bounds = plant.bounds if cost is None or cost.bounds is None else cost.bounds
+        none = torch.full_like(still, math.inf)
+        low, high = (-none, none) if bounds is None else (bounds.low.double(), bounds.high.double())
+        rate, columns = plant.motion(x, u), []
+        for k in range(u.shape[-1]):  # as far as a loop may go in a period
+            pushed = plant.motion(x, u + torch.eye(len(still)).double()[k]) - rate
+            push = float(pushed.abs().amax(-1).nan_to_num(0.0, 0.0).quantile(0.5))
+            width = _MOVED * plant.spread / (self.dt * push) if push > 0 else 1.0
+            least, most = (
+                max(float(low[k]), float(still[k]) - width),
+                min(float(high[k]), float(still[k]) + width),
+            )
+            columns.append(least + (most - least) * chance[:, k])
+        u = torch.stack(columns, dim=-1) if columns else u
+        moves = torch.isfinite(plant.motion(x, u)).all(-1)
+        return x[moves], u[moves]
 
 
-def runge_kutta_held(
-    plant: Plant, cost: Cost, x: Tensor, u: Tensor, length: float | Tensor
-) -> tuple[Tensor, Tensor]:
-    """x+ and the discounted cost of one Runge-Kutta step with u held, of one length, s, or one a row."""
-    rate = cost.input_rate(u)
+def _adds(plant: Plant) -> bool:
+    """Return whether a step of the motion is added to the state."""
+    kind = type(plant)
+    return kind.displaced is Plant.displaced and kind.velocity is Plant.velocity
 
-    def field(at: Tensor) -> tuple[Tensor, Tensor]:
-        return plant.velocity(at, u), rate + cost.state_rate(at)
 
-    return runge_kutta_loop(plant, field, x, length, cost.discount)
+def _square(matrix: Tensor, x: Tensor) -> Tensor:
+    return (times(matrix, x) * x).sum(-1)
 
 
 def runge_kutta_loop(
@@ -134,7 +378,8 @@ def runge_kutta_loop(
     x: Tensor,
     length: float | Tensor,
     discount: float = 0.0,
-) -> tuple[Tensor, Tensor]:
+    watch: bool = False,
+) -> tuple[Tensor, ...]:
     """`numerics.runge_kutta` as a loop over the stages, of which a program then contains one.
 
     Args:
@@ -143,20 +388,22 @@ def runge_kutta_loop(
         x: (..., n).
         length: s, a number or one a row.
         discount: 1/s, of what is paid.
+        watch: whether to return `Holding.watched`'s number, too.
 
     Returns:
         x+ (..., n) and what was paid, (...).
     """
 
-    def stage(now: RungeKuttaSums, share: tuple[Tensor, Tensor, Tensor]) -> tuple[RungeKuttaSums, tuple[()]]:
+    def stage(now: RungeKuttaSums, share: tuple[Tensor, Tensor, Tensor]) -> tuple[RungeKuttaSums, Any]:
         slope, moved, paid = now
         ahead, count, value = share
         slope, rate = field(plant.displaced(x, ahead * slope))
-        return (slope, moved + count * slope, paid + value * rate), ()
+        return (slope, moved + count * slope, paid + value * rate), slope if watch else ()
 
     start = torch.zeros_like(x), torch.zeros_like(x), torch.zeros_like(x[..., 0])
-    (_, moved, paid), _ = scan(stage, start, _shares(length, discount, x), dim=0)
-    return plant.displaced(x, moved), paid
+    (_, moved, paid), slopes = scan(stage, start, _shares(length, discount, x), dim=0)
+    after = plant.displaced(x, moved)
+    return (after, paid, length * (slopes[2] - slopes[1]).abs().amax(-1)) if watch else (after, paid)
 
 
 def _shares(length: float | Tensor, discount: float, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:

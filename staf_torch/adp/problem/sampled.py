@@ -20,6 +20,7 @@ from ...numerics.runge_kutta import runge_kutta_mean, runge_kutta_stages
 from ...systems import Bounds, Plant
 from ...systems.bounds import Limit
 from .cost import Cost
+from .held_plant import Holding
 from .tracking_cost import Path, TrackingCost
 
 StepFunction = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
@@ -80,6 +81,7 @@ class SampledProblem(nn.Module):
     ) -> None:
         super().__init__()
         self.step = step
+        self.holding: Holding | None = None  # of a plant in continuous time
         self.path: Path | None = path
         self.dim = integer("SampledProblem", "dim", dim, least=1)
         self.inputs = integer("SampledProblem", "inputs", inputs, least=1)
@@ -111,12 +113,20 @@ class SampledProblem(nn.Module):
 
     @classmethod
     def of(
-        cls, plant: Plant, cost: Cost, *, dt: float | None = None, low: Limit = None, high: Limit = None
+        cls,
+        plant: Plant,
+        cost: Cost,
+        *,
+        dt: float | None = None,
+        low: Limit = None,
+        high: Limit = None,
+        substeps: int | None = None,
     ) -> SampledProblem:
         """A plant and a cost rate, with the control held for dt.
 
-        A plant in continuous time takes one Runge-Kutta step of fourth order, and its cost with it;
-        one in discrete time pays its period times the cost rate.
+        A plant in continuous time is integrated to 1e-6 of its state, as `Holding` says: by one Runge-Kutta
+        step of fourth order, where that is enough, and its cost with it; one in discrete time pays its period
+        times the cost rate.
 
         Args:
             plant: the plant.
@@ -124,6 +134,7 @@ class SampledProblem(nn.Module):
             dt: s, positive; None for the period of a plant in discrete time.
             low: of the inputs; None for those of the cost, or else of the plant.
             high: likewise.
+            substeps: Runge-Kutta steps a period; None for as many as are accurate. Fewer are a warning.
 
         Raises:
             ValueError: if an argument breaks its rule, or as in `SampledProblem`.
@@ -141,8 +152,13 @@ class SampledProblem(nn.Module):
             raise fail("SampledProblem.of", "dt", f"must be the plant's period, {plant.period} s", dt)
 
         box = cost.bounds
-        return cls(
-            partial(_held, plant, cost, h) if plant.period is None else partial(_stepped, plant, cost),
+        holding: Holding | None = None
+        step: StepFunction = partial(_stepped, plant, cost)
+        if plant.period is None:
+            holding = Holding("SampledProblem.of", plant, cost, h, substeps).checked()
+            step = partial(_held, plant, cost, h) if holding.classical else holding
+        problem = cls(
+            step,
             dim=cost.dim,
             inputs=cost.inputs,
             low=None if box is None else box.low,
@@ -153,6 +169,8 @@ class SampledProblem(nn.Module):
             path=cost.path if isinstance(cost, TrackingCost) else None,
             terminal=cost.end,
         )
+        problem.holding = holding
+        return problem
 
     def advance(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
         """x+ and the cost of the step: (..., n), (..., m) -> (..., n), (...)."""

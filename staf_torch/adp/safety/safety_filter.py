@@ -12,11 +12,11 @@ from torch import Tensor
 
 from ...lanes import compiled, repeat
 from ...numerics.checks import fail, non_negative, one_or_each, positive, positive_real, trailing
-from ...numerics.runge_kutta import runge_kutta_step
 from ...systems import Bounds, Plant, StepPlant
 from ...systems.bounds import Limit
 from ..loop.controller import Carried, Controller, Feedback, Policy
 from ..loop.simulation import LoopResult
+from ..problem.held_plant import Holding
 from .quadratic_program import cases, nearest_admissible
 
 Constraint = Callable[[Tensor, Tensor], Tensor]
@@ -56,10 +56,10 @@ class SafetyFilter(Controller):
         phi = h (relative degree one),  phi = h' + decay h (relative degree two, h' along the plant).
 
     That is the exponential control barrier function of a control that is held: x(t + dt; u) is the plant
-    itself, by Runge-Kutta steps, linearised in u where it was found, until what u must satisfy it satisfies.
-    What phi dips between the samples, which
-    its value in the middle of the hold shows, is kept as a margin, so that phi and with it h stay
-    positive in between too. In the limit of a short hold the condition is phi' >= -decay phi. The quadratic
+    itself, integrated as everywhere, linearised in u where it was found, until what u must satisfy it
+    satisfies. What phi dips between the samples, which its value in the middle of the hold shows, is kept
+    as a margin, so that phi and with it h stay positive in between too. In the limit of a short hold the
+    condition is phi' >= -decay phi. The quadratic
     program is solved exactly: in closed form for one input, else by comparing all cases.
 
     A wanted control that satisfies everything is applied bit for bit. Bounds are hard; where they and the
@@ -137,6 +137,7 @@ class SafetyFilter(Controller):
         low_, high_ = self.bounds.low / self.unit, self.bounds.high / self.unit
         self.register_buffer("table", cases(count, low_.tolist(), high_.tolist()))
         self.table: Tensor
+        self.holding = Holding("SafetyFilter", plant, None, 0.5 * self.hold)
         self.degree, self.moving = self._probe(degree)
         second = torch.tensor(self.degree, dtype=torch.int64) == 2
         if bool((second & (self.decay * self.hold > 1)).any()):
@@ -311,8 +312,7 @@ class SafetyFilter(Controller):
 
     def _advance(self, x: Tensor, u: Tensor) -> Tensor:
         """x after half a hold."""
-        plant = self.plant
-        return runge_kutta_step(lambda at: plant.velocity(at, u), x, 0.5 * self.hold, plant.displaced)
+        return self.holding(x, u)[0]
 
     def _level(self, k: int) -> RowValue:
         """phi of one row: (1, n), () -> ()."""

@@ -148,7 +148,7 @@ class Leaning(systems.ControlAffineSystem):
 
 def test_a_problem_of_a_plant_has_its_rest_its_bounds_and_its_runge_kutta_step() -> None:
     cost = adp.QuadraticCost([2.0, 0.5], 0.7, 2, 1, target=[0.4, 0.0], low=-5.0, high=4.0)
-    problem = adp.SampledProblem.of(Leaning(), cost, dt=0.2)
+    problem = adp.SampledProblem.of(Leaning(), cost, dt=0.2, substeps=1)
     assert problem.goal.tolist() == [0.4, 0.0]
     assert problem.rest.tolist() == pytest.approx([-2.0 * math.sin(0.4) / 1.5])
     assert (problem.bounds.low.tolist(), problem.bounds.high.tolist()) == ([-5.0], [4.0])

@@ -1,0 +1,120 @@
+"""Accuracy of a simulated plant: which rows its integration steps were too long for, and how many they need.
+
+A loop records how much the rate bends within a step, which costs no call of the plant. Where that is much,
+the holds with the largest moves are repeated with twice the steps, and so on: a row's own number of steps
+follows, from nothing but what the row itself did.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ...numerics.exponential_step import stalls
+from ..problem.held_plant import GRACE, TOLERANCE, Holding
+
+_log = logging.getLogger(__name__)
+BENT = 3e-3  # of the state: more bending is looked at; of a mode (h / tau)^3 / 4, beside an error of 5e-6
+_TRIED = 16  # holds of a row
+_MOST, _MOST_FROZEN = 1024, 64  # times the steps; of a row that left the finite numbers
+_TOGETHER = 1 << 16  # holds that are repeated at once
+
+
+class Needed(NamedTuple):
+    """What a row needs."""
+
+    factor: Tensor  # (R,) int64, times the steps
+    error: Tensor  # (R,) that is left with them, relative
+
+
+@torch.no_grad()
+def needed(holding: Holding, x: Tensor, u: Tensor, frozen: Tensor, most: int = _MOST) -> Needed:
+    """Return by how much rows must multiply their steps for 1e-6 in all of their holds.
+
+    Args:
+        holding: as it was.
+        x: states of K holds a row, (R, K, n).
+        u: controls, NaN where there was none, (R, K, m).
+        frozen: (R,) bool: rows that left the finite numbers.
+        most: steps of a hold.
+    """
+    rows = max(1, _TOGETHER // x.shape[1])
+    parts = [
+        _needed(holding, *part, most) for part in zip(*(t.split(rows) for t in (x, u, frozen)), strict=True)
+    ]
+    return Needed(*(torch.cat(column) for column in zip(*parts, strict=True)))
+
+
+def _needed(holding: Holding, x: Tensor, u: Tensor, frozen: Tensor, limit: int) -> Needed:
+    count = len(x)
+    factor, error = torch.ones(count, dtype=torch.int64), torch.full((count,), math.inf, dtype=torch.float64)
+    rows, last, times = torch.arange(count), torch.full((count,), math.inf, dtype=torch.float64), 1
+    known = torch.isfinite(u).all(-1) & torch.isfinite(x).all(-1)
+    while len(rows):
+        at, held = x[rows], u[rows].nan_to_num(0.0)
+        now = _errors(holding if times == 1 else holding.finer(times), at, held, known[rows])
+        factor[rows], error[rows] = times, now
+        pairs = zip(now.tolist(), last.tolist(), strict=True)
+        stalled = torch.tensor([stalls(one, before) for one, before in pairs], dtype=torch.bool)
+        most = torch.where(frozen[rows].cpu(), min(limit, _MOST_FROZEN), limit)
+        further = (
+            (now > (GRACE if times == 1 else 1.0) * TOLERANCE)
+            & ~stalled
+            & (2 * times * holding.steps <= most)
+        )
+        rows, last, times = rows[further], now[further], 2 * times
+    return Needed(factor, error)
+
+
+def _errors(holding: Holding, x: Tensor, u: Tensor, known: Tensor) -> Tensor:
+    """Return the largest error of a row's holds, relative to its largest state and cost: (R,)."""
+    worst = torch.zeros(len(x), dtype=torch.float64)
+    for wrong, size in holding.doubled(x.flatten(0, 1), u.flatten(0, 1)):
+        off, large = (torch.where(known, part.view(known.shape), 0.0) for part in (wrong, size))
+        large = torch.where(torch.isfinite(large), large, 0.0).amax(1)
+        worst = torch.maximum(worst, (off.amax(1) / large).nan_to_num(math.inf, math.inf).double().cpu())
+    return worst
+
+
+def largest_moves(state: Tensor, control: Tensor, rest: Tensor, frozen: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the holds of every row in which it moved most, the first one, and where it froze.
+
+    Args:
+        state: (R, T, n).
+        control: (R, T, m), NaN where none was held.
+        rest: u that holds the set-point, (m,), for a row that froze in its first hold.
+        frozen: (R,) bool.
+
+    Returns:
+        (R, K, n), (R, K, m).
+    """
+    held = torch.isfinite(control[:, :-1]).all(-1)
+    moved = (state[:, 1:] - state[:, :-1]).abs().amax(-1)
+    moved[:, 0] = torch.inf
+    moved = torch.where(held, moved, -1.0)
+    at = moved.topk(min(_TRIED, moved.shape[1]), dim=1).indices.unsqueeze(-1)
+    x = state.gather(1, at.expand(-1, -1, state.shape[-1]))
+    u = control.gather(1, at.expand(-1, -1, control.shape[-1]))
+    last = (held.sum(1) - 1).clamp(min=0)[:, None, None].expand(-1, -1, control.shape[-1])
+    before = control.gather(1, last)
+    before = torch.where(torch.isfinite(before), before, rest.to(before))
+    before = torch.where(frozen[:, None, None], before, torch.nan)
+    return torch.cat((x, state[:, -1:]), dim=1), torch.cat((u, before), dim=1)
+
+
+def warn_of_errors(holding: Holding, rows: Tensor, found: Needed, remedy: str) -> None:
+    """Say in the log which rows were integrated with errors that matter."""
+    wrong = found.error > GRACE * TOLERANCE
+    if not bool(wrong.any()):
+        return
+    worst, steps = int(found.error.argmax()), holding.steps * int(found.factor[wrong].max())
+    _log.warning(
+        "`simulate`: with up to %d integration steps a period of %.4g s the next state is wrong by more than "
+        "%.0e of its size in %d rows, by %.2g in row %d. %s",
+        *(steps, holding.dt, GRACE * TOLERANCE, int(wrong.sum()), float(found.error[worst])),
+        *(int(rows[worst]), remedy),
+    )

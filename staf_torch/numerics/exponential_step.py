@@ -1,0 +1,179 @@
+"""Exponential Runge-Kutta steps, exact where x' = A x + c, and the fewest steps that are accurate enough.
+
+A classical step multiplies a mode of 1/tau by a polynomial of h/tau, and is wrong or unstable where h > tau.
+Here the linear part A of the rate is solved by its exponential and only the remainder N(x) = x' - A x is
+approximated, by a quadratic through its values at the stages. With A = 0 the step is the classical one.
+
+Source: Krogstad, "Generalized integrating factor methods for stiff PDEs", J. Comput. Phys. 203 (2005);
+Cox and Matthews, J. Comput. Phys. 176 (2002), for the weights.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..lanes import scan
+from .linalg import exponential
+
+_NEAR = 4.0  # an error that doubling the steps divides by less is one of rounding, or of a rate with corners
+_SMALL = 1e-3  # relative errors above which more steps are tried all the same
+
+
+class ExponentialStep(NamedTuple):
+    """Matrices of a step of one length h; displacements are those from the state at the start."""
+
+    linear: Tensor  # A, (n, n)
+    begun: Tensor  # (4, n, n) displacement of a stage by N at the start
+    before: Tensor  # (4, n, n) displacement of a stage by N of the stage before
+    weight: Tensor  # (4, n, n) displacement of the step by N of each stage
+    starts: Tensor  # (4, 1) 1 at the first stage
+    paid: Tensor | None  # (4 n, 4 n) W of z'Wz = int d'Q d e^(-rho s) ds, z = (d, N first, middle, last)
+
+
+def quadratic_integral(matrix: Tensor, rate: Tensor, length: float) -> tuple[Tensor, Tensor]:
+    """Return e^(M t) and int_0^t e^(M s)' R e^(M s) ds, (n, n) float64 each.
+
+    The exponential of a short step is doubled: e^(M 2h) = (e^(M h))^2, W(2h) = W(h) + e^(M h)' W(h) e^(M h).
+
+    Args:
+        matrix: M, (n, n).
+        rate: R, (n, n), symmetric.
+        length: t, s.
+
+    Source: Van Loan, "Computing integrals involving the matrix exponential", IEEE TAC 23 (1978).
+    """
+    size = len(matrix)
+    doublings = max(
+        0, 2 + math.ceil(math.log2(max(float(torch.linalg.matrix_norm(matrix, 1)) * length, 1e-9)))
+    )
+    h = length / 2**doublings
+    rows = torch.cat((-matrix.mT, rate), dim=1), torch.cat((torch.zeros_like(matrix), matrix), dim=1)
+    step = exponential(h * torch.cat(rows))
+    flow = step[size:, size:]
+    paid = flow.mT @ step[:size, size:]
+    for _ in range(doublings):
+        paid = paid + flow.mT @ paid @ flow
+        flow = flow @ flow
+    return flow, 0.5 * (paid + paid.mT)
+
+
+def exponential_step(
+    linear: Tensor, h: float, curvature: Tensor | None = None, discount: float = 0.0
+) -> ExponentialStep:
+    """Return the matrices of steps of length h.
+
+    Args:
+        linear: A, (n, n), 1/s.
+        h: s.
+        curvature: Q of a cost rate d'Qd that is to be integrated exactly, (n, n); None for none.
+        discount: rho, 1/s, of that integral.
+    """
+    a = linear.double()
+    n, zero = len(a), torch.zeros_like(a)
+    (one, two, three), (half_one, half_two, _) = _phi(a, h), _phi(a, 0.5 * h)
+    begun = torch.stack((zero, zero, h * (0.5 * half_one - half_two), h * (one - 2 * two)))
+    before = torch.stack((zero, 0.5 * h * half_one, h * half_two, 2 * h * two))
+    middle = h * (2 * two - 4 * three)
+    weight = torch.stack((h * (one - 3 * two + 4 * three), middle, middle, h * (4 * three - two)))
+    starts = torch.tensor([[1.0], [0.0], [0.0], [0.0]], dtype=torch.float64)
+    paid = None
+    if curvature is not None:
+        # (moved, N, N', N'', d at the start): moved' = A moved + N.
+        whole = torch.zeros(5 * n, 5 * n, dtype=torch.float64)
+        whole[:n, :n] = a
+        for k in range(3):
+            whole[k * n : (k + 1) * n, (k + 1) * n : (k + 2) * n] = torch.eye(n, dtype=torch.float64)
+        both = torch.zeros(n, 5 * n, dtype=torch.float64)
+        both[:, :n] = both[:, 4 * n :] = torch.eye(n, dtype=torch.float64)
+        rate = both.mT @ curvature.double() @ both
+        _, integral = quadratic_integral(whole - 0.5 * discount * torch.eye(5 * n).double(), rate, h)
+        stages = torch.tensor([[1.0, 0.0, 0.0], [-3 / h, 4 / h, -1 / h], [4 / h**2, -8 / h**2, 4 / h**2]])
+        basis = torch.zeros(5, 4, dtype=torch.float64)
+        basis[1:4, 1:], basis[4, 0] = stages.double(), 1.0
+        turned = torch.kron(basis, torch.eye(n, dtype=torch.float64))
+        paid = turned.mT @ integral @ turned
+    return ExponentialStep(a, begun, before, weight, starts, paid)
+
+
+def _phi(a: Tensor, h: float) -> tuple[Tensor, Tensor, Tensor]:
+    """phi_1, phi_2, phi_3 of h A, (n, n) each."""
+    n = len(a)
+    whole = torch.zeros(4 * n, 4 * n, dtype=torch.float64)
+    whole[:n, :n] = h * a
+    for k in range(3):
+        whole[k * n : (k + 1) * n, (k + 1) * n : (k + 2) * n] = torch.eye(n, dtype=torch.float64)
+    found = exponential(whole)[:n]
+    return found[:, n : 2 * n], found[:, 2 * n : 3 * n], found[:, 3 * n :]
+
+
+def times(matrix: Tensor, x: Tensor) -> Tensor:
+    """M x of every row: (k, n), (..., n) -> (..., k), of the same bits in every batch."""
+    return (matrix * x.unsqueeze(-2)).sum(-1)
+
+
+def exponential_stages(
+    table: ExponentialStep, field: Callable[[Tensor], tuple[Tensor, Tensor]], x: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Take one step: the displacement (..., n), N (4, ..., n) and what else the field gives (4, ...).
+
+    Args:
+        table: of the length and the plant.
+        field: x' and another number at a displacement from x, (..., n) -> (..., n), (...).
+        x: (..., n), for its shape, dtype and device.
+    """
+
+    def stage(
+        now: tuple[Tensor, Tensor, Tensor], share: tuple[Tensor, Tensor, Tensor, Tensor]
+    ) -> tuple[tuple[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]:
+        first, last, moved = now
+        begun, before, weight, starts = share
+        away = times(begun, first) + times(before, last)
+        velocity, number = field(away)
+        rest = velocity - times(linear, away)
+        return (first + starts * rest, rest, moved + times(weight, rest)), (rest, number)
+
+    linear, zero = table.linear.to(x), torch.zeros_like(x)
+    shares = tuple(part.to(x) for part in (table.begun, table.before, table.weight, table.starts))
+    (_, _, moved), (rests, numbers) = scan(stage, (zero, zero, zero), shares, dim=0)
+    return moved, rests, numbers
+
+
+class StepCount(NamedTuple):
+    """A number of steps and the relative error that is left with it."""
+
+    count: int
+    error: float
+
+
+def fewest_steps(errors: Callable[[int], Tensor], tolerance: float, most: int) -> StepCount:
+    """Return the fewest steps of fourth order for which all samples are accurate.
+
+    An error that no longer falls with the steps is one of rounding or of a rate with corners: the search
+    ends there.
+
+    Args:
+        errors: of so many steps, by step doubling, (P,).
+        tolerance: of them.
+        most: steps.
+    """
+    count, last = 1, math.inf
+    while True:
+        each = errors(count)
+        error = float(each.max()) if len(each) else 0.0
+        if error <= tolerance:
+            if math.isfinite(last):  # perhaps fewer: the error falls with the fourth power of the steps
+                count = max(count // 2 + 1, math.ceil(count * (error / tolerance) ** 0.25))
+            return StepCount(count, error)
+        if stalls(error, last) or 2 * count > most:
+            return StepCount(count, error)
+        count, last = 2 * count, error
+
+
+def stalls(error: float, last: float) -> bool:
+    """Return whether twice the steps were of no use, because of rounding or corners of the rate."""
+    return error <= _SMALL and error * _NEAR > last
