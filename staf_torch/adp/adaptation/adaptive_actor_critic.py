@@ -15,6 +15,7 @@ from ..critic.actor_critic import ActorCritic
 from ..critic.bellman import BellmanTerms
 from ..critic.laws import Weights
 from ..loop.controller import Controller, Policy
+from ..planning.ddp import chosen
 from ..problem.cost import matvec
 from .history_stack import ConcurrentLearning, Identified
 from .least_squares import Estimate, LeastSquares
@@ -42,7 +43,8 @@ class AdaptiveActorCritic(Controller):
     with C the covariance of theta^ and grad V^ that of the critic. The weights of a wrong model may be such
     that a law that iterates policies does not find back when the model is right. In doubt the ``robust``
     policy has the control. Where an alarm of ``law`` says that the plant is another one, the weights begin
-    anew.
+    anew. Where a measured state has a NaN the control is held and nothing is learned; the result records how
+    often so far as ``missed``.
 
     Example:
         >>> def regressor(x, u):  # damping of a pendulum that hangs
@@ -111,31 +113,37 @@ class AdaptiveActorCritic(Controller):
     def init(self, x0: Tensor) -> LearnedModel:
         estimate = self.law.init(x0)
         if self.known is not None:
-            pairs = zip(self.known, estimate, strict=True)
-            estimate = Estimate(*(part.to(x0).expand(like.shape).clone() for part, like in pairs))
-        return LearnedModel(
-            self.learner.init(x0), estimate, torch.zeros_like(x0[:, 0]), self.windows.init(x0)
-        )
+            pairs = zip(self.known[:-1], estimate[:-1], strict=True)  # all but what was missed
+            estimate = Estimate(
+                *(part.to(x0).expand(like.shape).clone() for part, like in pairs), estimate[-1]
+            )
+        window = self.windows.init(x0)
+        window = self.windows.holding(window, self.learner.cost.input_of(window.u))
+        return LearnedModel(self.learner.init(x0), estimate, torch.zeros_like(x0[:, 0]), window)
 
     def recorded(self, carried: LearnedModel) -> dict[str, Tensor]:
-        weights, estimate, certain, _ = carried
-        return {**self.learner.recorded(weights), **estimate.recorded(), "certain": certain}
+        weights, estimate, certain, window = carried
+        own = {"certain": certain, "missed": window.missed}
+        return {**self.learner.recorded(weights), **estimate.recorded(), **own}
 
     def step(self, x: Tensor, now: LearnedModel, uniform: Tensor, dt: float) -> tuple[Tensor, LearnedModel]:
         window, equation = self.windows.step(now.window, x, dt)
         estimate, weights = self.law.step(now.estimate, equation, dt), now.weights
         if self.law.alarm is not None:
             anew = estimate.resets > now.estimate.resets
-            weights = _chosen(anew, self.learner.init(x), weights)
+            weights = chosen(anew, self.learner.init(x), weights)
         model = self.model.believing(estimate.theta.unsqueeze(-2))  # one a row, for all its points
         terms = self.learner.terms(x, weights.actor, uniform, model)
         certain = self.certain(x, weights.critic, uniform, terms, estimate)
-        weights = _chosen(certain, self.learner.moved(terms, weights, dt), weights)
+        weights = chosen(certain, self.learner.moved(terms, weights, dt), weights)
         u = terms.control[..., 0, :]
         if self.robust is not None:
             u = torch.where(certain.unsqueeze(-1), u, self.robust(x))
         u = self.learner.cost.admissible(u)  # what the actuator will give, which the window must know
-        return u, LearnedModel(weights, estimate, certain.to(x), self.windows.holding(window, u))
+        missing = x.isnan().any(-1)
+        weights = chosen(missing, now.weights, weights)
+        u, sure = chosen(missing, (now.window.u, now.certain), (u, certain.to(x)))
+        return u, LearnedModel(weights, estimate, sure, self.windows.holding(window, u))
 
     def value(self, x: Tensor, recorded: Mapping[str, Tensor]) -> Tensor:
         return self.learner.value(x, recorded)
@@ -159,19 +167,13 @@ class AdaptiveActorCritic(Controller):
         return (self.confidence**2 * variance < (self.share * terms.rate).square()).all(-1)
 
 
-def _chosen(where: Tensor, one: Weights, other: Weights) -> Weights:
-    """The weights of one where it says so, those of the other elsewhere."""
-    pairs = zip(one, other, strict=True)
-    return Weights(
-        *(torch.where(where[(..., *[None] * (new.dim() - where.dim()))], new, old) for new, old in pairs)
-    )
-
-
 class Identifying(NamedTuple):
     """Carried state of an `IdentifyingTracker`."""
 
     weights: Weights
     known: Identified
+    u: Tensor  # (..., m) held since the last measurement
+    missed: Tensor  # (...) measurements with a NaN so far
 
 
 class IdentifyingTracker(Controller):
@@ -179,7 +181,8 @@ class IdentifyingTracker(Controller):
 
     The plant takes mu measured from the ud of the true theta, so this returns mu + ud(theta^) - ud(theta):
     the control u that reaches the plant knows theta^ alone, and the cost counts what it deviates from the
-    true feedforward. The plant's rate x' is measured without noise.
+    true feedforward. The plant's rate x' is measured without noise. Where a measured state has a NaN the
+    control is held and nothing is learned; the result records how often so far as ``missed``.
 
     Example:
         >>> plant, cost = systems.TwoStateTracking(), adp.tracking_cost(10.0, 1.0)
@@ -213,13 +216,18 @@ class IdentifyingTracker(Controller):
 
     def init(self, x0: Tensor) -> Identifying:
         first = self.first.to(x0).repeat(len(x0), 1, 1)
-        return Identifying(self.learner.init(x0), self.identifier.init(first))
+        held = x0.new_zeros(len(x0), self.plant.inputs)
+        return Identifying(
+            self.learner.init(x0), self.identifier.init(first), held, torch.zeros_like(x0[:, 0])
+        )
 
     def recorded(self, carried: Identifying) -> dict[str, Tensor]:
-        return {**self.learner.recorded(carried.weights), "theta": carried.known.theta}
+        own = {"theta": carried.known.theta, "missed": carried.missed}
+        return {**self.learner.recorded(carried.weights), **own}
 
     def step(self, x: Tensor, carried: Identifying, uniform: Tensor, dt: float) -> tuple[Tensor, Identifying]:
-        weights, known = carried
+        weights, known, held, missed = carried
+        missing = x.isnan().any(-1)
         model = self.model.believing(known.theta.unsqueeze(-3))  # one theta a row, for all its points
         terms = self.learner.terms(x, weights.actor, uniform, model)
         state, desired = x[..., :2] + x[..., 2:], x[..., 2:]
@@ -227,7 +235,9 @@ class IdentifyingTracker(Controller):
         measured = parametric_drift(self.plant.theta, state)
         known = self.identifier.step(known, regressor(state), measured, dt)
         u = terms.control[..., 0, :] + excess.unsqueeze(-1)
-        return u, Identifying(self.learner.moved(terms, weights, dt), known)
+        (theta, u) = chosen(missing, (carried.known.theta, held), (known.theta, u))
+        weights = chosen(missing, weights, self.learner.moved(terms, weights, dt))
+        return u, Identifying(weights, known._replace(theta=theta), u, missed + missing.to(missed))
 
     def value(self, x: Tensor, recorded: Mapping[str, Tensor]) -> Tensor:
         return self.learner.value(x, recorded)

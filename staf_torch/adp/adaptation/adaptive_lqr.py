@@ -11,6 +11,7 @@ from torch import Tensor
 from ...numerics.checks import fail, non_negative, positive_real, real
 from ...numerics.riccati import product
 from ..loop.controller import LQR, Controller, Policy
+from ..planning.ddp import chosen
 from ..policies.rollout import RolloutPolicy, fitted_slope
 from ..problem.cost import Cost, matvec, quadratic
 from .consider import Considered, ConsiderFilter
@@ -44,6 +45,9 @@ class AdaptiveLQR(Controller):
     The Riccati equation is solved by structured doubling, anew at every control. With a ``rollout`` the LQR
     of the moment is its base and the model of the moment its model. With a ``filter`` that LQR sees the
     filter's mean in place of what is measured; the identifier and the robust policy see the measurement.
+
+    Where a measured state has a NaN its window is lost, and the result records how often so far as
+    ``missed``. The control is then held; with a ``filter`` it is that of the mean, as both policies see it.
 
     Example:
         >>> def regressor(x, u):  # damping and inertia of an inverted pendulum
@@ -118,11 +122,12 @@ class AdaptiveLQR(Controller):
         zero, filter = x0.new_zeros(len(x0)), self.filter
         estimate, window = self.law.init(x0, self.theta), self.windows.init(x0)
         belief = None if filter is None else filter.init(x0)
+        window = self.windows.holding(window, self.cost.input_of(window.u))
         square = x0.new_zeros(*x0.shape, x0.shape[-1])
         return Adaptation(estimate, zero, zero - 1, zero.clone(), window, square, belief)
 
     def recorded(self, carried: Adaptation) -> dict[str, Tensor]:
-        own = {"certain": carried.certain, "alarmed_at": carried.alarmed_at}
+        own = {"certain": carried.certain, "alarmed_at": carried.alarmed_at, "missed": carried.window.missed}
         return {**carried.estimate.recorded(), **own}
 
     def step(self, x: Tensor, now: Adaptation, uniform: Tensor, dt: float) -> tuple[Tensor, Adaptation]:
@@ -132,15 +137,17 @@ class AdaptiveLQR(Controller):
         p = self.redesign.step(now.p, a, b)
         k = product(product(self.cost.r_inverse.to(b), b.mT), p)
         certain = self.redesign.solved(p, a, b) & (self.doubt(estimate.covariance, p, k) < 1)
-        belief = now.belief
+        belief, missing = now.belief, x.isnan()
         if self.filter is not None and belief is not None:
             belief = self.filter.step(belief, x, now.window.u, estimate, dt)
+            x, missing = torch.where(missing, belief.mean, x), torch.zeros_like(missing)
         u = self._control(x if belief is None else belief.mean, estimate.theta, p, k)
         doubtful = self.robust(x)
         if self.probe:
             doubtful = doubtful + self._probing(now.time)
         # What the actuator will give, which the window must know.
         u = self.cost.admissible(torch.where(certain.unsqueeze(-1), u, doubtful))
+        (u,) = chosen(missing.any(-1), (now.window.u,), (u,))
         alarmed = estimate.resets > now.estimate.resets
         alarmed_at = torch.where(alarmed, now.time, now.alarmed_at)
         window = self.windows.holding(window, u)

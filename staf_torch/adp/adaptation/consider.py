@@ -15,6 +15,8 @@ from ..problem.held_plant import Holding
 from .least_squares import Estimate
 from .parametric import ParametricPlant
 
+_UNKNOWN = 1e3  # deviations of the noise: that of a state that the first measurement lacks
+
 
 class Considered(NamedTuple):
     """Estimate of a `ConsiderFilter`: x = mean + e + sensitivity (theta - theta^), Cov e = covariance."""
@@ -24,6 +26,7 @@ class Considered(NamedTuple):
     sensitivity: Tensor  # (..., n, p)
     theta: Tensor  # (..., p) that the mean was made with
     steps: Tensor  # (...) measurements so far
+    missed: Tensor  # (..., n) of every state, measurements of it that were missing
 
 
 class ConsiderFilter:
@@ -35,6 +38,9 @@ class ConsiderFilter:
 
     H says how an error of theta^ shows in x^: while theta is unknown the measurement counts, once it is known
     the model does, and where theta^ changes x^ follows. theta itself is left to a law as `LeastSquares`.
+
+    An entry of y that is NaN is missing: the others are used, and `Considered.missed` counts it. What the
+    first measurement lacks is the plant's equilibrium, with 1000 times the deviation of the noise.
 
     Example:
         >>> plant = adp.ParametricPlant.of_effectiveness(systems.Pendulum())
@@ -86,6 +92,7 @@ class ConsiderFilter:
             x.new_zeros(*lead, n, p),
             x.new_zeros(*lead, p),
             x.new_zeros(lead),
+            torch.zeros_like(x),
         )
 
     def step(self, state: Considered, y: Tensor, u: Tensor, estimate: Estimate, dt: float) -> Considered:
@@ -93,7 +100,7 @@ class ConsiderFilter:
 
         Args:
             state: after the measurement before.
-            y: (..., n), measured now.
+            y: (..., n), measured now; NaN where it was not.
             u: (..., m), held since the measurement before.
             estimate: of theta, with its covariance.
             dt: s since then.
@@ -109,19 +116,23 @@ class ConsiderFilter:
         own = product(product(slope, state.covariance), slope.mT)
         own = own + torch.diag(self.process.to(y).square() * dt)
         shown = product(product(sensitivity, estimate.covariance), sensitivity.mT)
-        r = torch.diag(self.noise.to(y).square())
-        whole = own + shown
-        gain = product(whole, torch.linalg.inv_ex(whole + r)[0])
+        missing, variance = y.isnan(), self.noise.to(y).square()
+        seen, r = (~missing).to(y), torch.diag(variance)
+        whole = (own + shown) * seen.unsqueeze(-2)  # of the measured states, (..., n, n)
+        gain = product(whole, torch.linalg.inv_ex(whole * seen.unsqueeze(-1) + r)[0])
         kept = torch.eye(y.shape[-1]).to(y) - gain
-        left = self.model.difference(y, mean)
+        left = self.model.difference(torch.where(missing, mean, y), mean)
         mean = mean + (gain * left.unsqueeze(-2)).sum(-1)
         own = product(product(kept, own), kept.mT) + product(product(gain, r), gain.mT)
         first = state.steps == 0
         wide = first[..., None, None]
+        begun = torch.where(missing, self.model.equilibrium().to(y), y)
+        unknown = torch.where(missing, _UNKNOWN**2 * variance, variance)
         return Considered(
-            torch.where(first.unsqueeze(-1), y, mean),
-            torch.where(wide, r, own),
+            torch.where(first.unsqueeze(-1), begun, mean),
+            torch.where(wide, torch.diag_embed(unknown), own),
             torch.where(wide, 0.0, product(kept, sensitivity)),
             theta,
             state.steps + 1,
+            state.missed + missing.to(y),
         )

@@ -13,9 +13,10 @@ from ...kernels import Kernel
 from ...numerics.checks import fail, non_negative, positive_real, real
 from ...numerics.linalg import row_jacobian
 from ...numerics.pivoted_cholesky import newton_basis
-from ...numerics.riccati import product
+from ...numerics.riccati import measured, product
 from ...systems import ControlAffineSystem
 from ..loop.controller import LQR, Controller, Policy
+from ..planning.ddp import chosen
 from ..problem.cost import Cost, matvec, quadratic
 from .parametric import ParametricPlant
 from .redesign import Redesign
@@ -141,11 +142,11 @@ class StreamDrift:
         Args:
             estimate: before it.
             equation: of `window_of` this estimate.
-            x: (..., n), measured at the equation's end.
+            x: (..., n), measured at the equation's end; of no matter where it is not ready.
             dt: s since the step before.
         """
         mean, p, ready = estimate.mean, estimate.covariance, equation.ready
-        scale = self.deviation
+        scale, x = self.deviation, torch.where(ready.unsqueeze(-1), x, estimate.anchor)
         if self.forgetting:
             identity = torch.eye(p.shape[-1], dtype=p.dtype, device=p.device)
             p = identity + (p - identity) / (1 + self.forgetting * dt)
@@ -157,7 +158,7 @@ class StreamDrift:
         gain = torch.where(ready, 1 / ((ps * s).sum(-1) + noise), 0.0)
         missing = equation.z - (s.unsqueeze(-2) * mean).sum(-1)  # (..., r)
         mean = mean + (gain.unsqueeze(-1) * missing).unsqueeze(-1) * ps.unsqueeze(-2)
-        p = p - gain[..., None, None] * ps.unsqueeze(-1) * ps.unsqueeze(-2)
+        p = measured(p, gain.unsqueeze(-1) * ps, s, noise)
         return self._moved(DriftEstimate(estimate.anchor, mean, p), x, ready)
 
     def predict(self, estimate: DriftEstimate, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -254,7 +255,8 @@ class DriftLQR(Controller):
         certain:  2 c s |(Pe)_rows| < e'We,   e = x - x_s,   W = Q + K'RK,
 
     with s the standard deviation of the drift at x: e'Pe falls at x for every drift within c deviations. The
-    robust policy has the control elsewhere; `LoopResult` records it as ``certain``.
+    robust policy has the control elsewhere; `LoopResult` records it as ``certain``. Where a measured state
+    has a NaN the control is held and nothing is learned; ``missed`` counts it.
 
     Example:
         >>> known = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
@@ -299,15 +301,16 @@ class DriftLQR(Controller):
 
     def init(self, x0: Tensor) -> DriftAdaptation:
         window, p = self.drift.windows.init(x0), x0.new_zeros(*x0.shape, x0.shape[-1])
+        window = self.drift.windows.holding(window, self.cost.input_of(window.u))
         return DriftAdaptation(self.drift.init(x0), x0.new_zeros(len(x0)), window, p)
 
     def recorded(self, carried: DriftAdaptation) -> dict[str, Tensor]:
-        return {"certain": carried.certain}
+        return {"certain": carried.certain, "missed": carried.window.missed}
 
     def step(
         self, x: Tensor, now: DriftAdaptation, uniform: Tensor, dt: float
     ) -> tuple[Tensor, DriftAdaptation]:
-        windows = self.drift.window_of(now.estimate)
+        windows, missing = self.drift.window_of(now.estimate), x.isnan().any(-1)
         window, equation = windows.step(now.window, x, dt)
         estimate = self.drift.step(now.estimate, equation, x, dt)
         a, covariance = self.drift.matrix(estimate, x)
@@ -323,4 +326,6 @@ class DriftLQR(Controller):
         wanted = self.cost.saturate(self.cost.input_of(-matvec(k, e)))
         # What the actuator will give, which the window must know.
         u = self.cost.admissible(torch.where(certain.unsqueeze(-1), wanted, self.robust(x)))
-        return u, DriftAdaptation(estimate, certain.to(x), windows.holding(window, u), p)
+        after = u, certain.to(x), p
+        u, sure, p = chosen(missing, (now.window.u, now.certain, now.p), after)
+        return u, DriftAdaptation(estimate, sure, windows.holding(window, u), p)

@@ -28,6 +28,7 @@ class Stack(NamedTuple):
     turn: Tensor  # (...) the place that is tried next; 0: none, k: place k - 1; -1: nothing is tried
     best: Tensor  # (...) the largest least eigenvalue so far
     place: Tensor  # (...) where; -1: as it is
+    missed: Tensor  # (...) equations with a row that was not finite
 
 
 class HistoryStack:
@@ -36,7 +37,7 @@ class HistoryStack:
     Empty places are filled with what differs enough from the equation before. Then an equation takes the
     place with which the least eigenvalue grows most, if it grows. One place is tried a step: an equation is
     in after N + 1 steps, and those that come meanwhile are not looked at. A step costs one eigenvalue
-    problem, not N.
+    problem, not N. Rows of an equation that are not finite are left out and counted: `Stack.missed`.
 
     Example:
         >>> from staf_torch.adp.adaptation.windows import Equation
@@ -86,10 +87,11 @@ class HistoryStack:
         s, z = x.new_zeros(*lead, self.size, r, p), x.new_zeros(*lead, self.size, r, *self._sides)
         gram, moment = x.new_zeros(*lead, p, p), x.new_zeros(*lead, p, *self._sides)
         tried_s, tried_z = x.new_zeros(*lead, r, p), x.new_zeros(*lead, r, *self._sides)
-        return Stack(s, z, gram, moment, zero, tried_s, tried_z, zero - 1, zero, zero - 1)
+        return Stack(s, z, gram, moment, zero, tried_s, tried_z, zero - 1, zero, zero - 1, zero)
 
     def step(self, state: Stack, equation: Equation) -> Stack:
         """The stack after one more trial, with the equation where it is ready and fits."""
+        state, equation = _seen(state, equation)
 
         def busy(now: tuple[Stack, Equation]) -> Tensor:
             return now[1].ready | (now[0].turn >= 0)
@@ -103,6 +105,7 @@ class HistoryStack:
 
     def take(self, state: Stack, equation: Equation) -> Stack:
         """The stack with the equation in it, where it is ready and fits: all places are tried at once."""
+        state, equation = _seen(state, equation)
         fills = self._fills(state, equation)
         trials = state.gram.unsqueeze(-3) + (_gram(equation.s).unsqueeze(-3) - _gram(state.s))
         best, place = torch.linalg.eigvalsh(_finite(trials))[..., 0].max(dim=-1)
@@ -142,16 +145,26 @@ class HistoryStack:
     def _placed(self, state: Stack, goes: Tensor, fills: Tensor) -> Stack:
         """The stack with the equation that was tried in a place, -1 for none; empty places hold zeros."""
         chosen = torch.arange(self.size, device=state.s.device) == goes.unsqueeze(-1)
-        s, z, share = state.tried_s, state.tried_z, chosen.to(state.s)
-        gone_s, gone_z = _picked(share, state.s), _picked(share, state.z)
-        gram, moment = _gram(s) - _gram(gone_s), _moment(s, z) - _moment(gone_s, gone_z)
+        places = chosen.dim() - 1
+        s = torch.where(_beside(chosen, state.s), state.tried_s.unsqueeze(places), state.s)
+        z = torch.where(_beside(chosen, state.z), state.tried_z.unsqueeze(places), state.z)
+        # Anew and not by a difference: what rounding leaves of a large equation would stay when it is gone.
+        gram, moment = _gram(s).sum(places), _moment(s, z).sum(places)
         return state._replace(
-            s=torch.where(_beside(chosen, state.s), s.unsqueeze(-3), state.s),
-            z=torch.where(_beside(chosen, state.z), z.unsqueeze(chosen.dim() - 1), state.z),
-            gram=state.gram + torch.where(_beside(goes >= 0, gram), gram, 0.0),
-            moment=state.moment + torch.where(_beside(goes >= 0, moment), moment, 0.0),
+            s=s,
+            z=z,
+            gram=torch.where(_beside(goes >= 0, gram), gram, state.gram),
+            moment=torch.where(_beside(goes >= 0, moment), moment, state.moment),
             filled=state.filled + fills.to(state.filled),
         )
+
+
+def _seen(state: Stack, equation: Equation) -> tuple[Stack, Equation]:
+    """The equation without rows that are not finite, none where no row is, and the stack that counts them."""
+    lost, (equation, fine) = equation.ready, equation.finite()
+    lost = lost & ~fine.all(-1)
+    ready = equation.ready & fine.any(-1)
+    return state._replace(missed=state.missed + lost.to(state.missed)), equation._replace(ready=ready)
 
 
 def _tried(state: Stack, equation: Equation, where: Tensor) -> Stack:
@@ -298,8 +311,11 @@ class ConcurrentLearning:
         return Identified(theta, self.stack.init(theta[..., 0]))
 
     def step(self, state: Identified, s: Tensor, y: Tensor, dt: float) -> Identified:
-        """The estimate after ``dt`` seconds of the measurement y (..., n) at the regressor s (..., p)."""
+        """The estimate after ``dt`` seconds of the measurement y (..., n) at the regressor s (..., p). A pair
+        with an entry that is not finite moves nothing, and counts in ``missed`` of the stack."""
         stack = self.remember(state, s, y).stack
+        fine = (torch.isfinite(s).all(-1) & torch.isfinite(y).all(-1)).unsqueeze(-1)
+        s, y = torch.where(fine, s, 0.0), torch.where(fine, y, 0.0)
         gram, moment = stack.gram + _outer(s, s), stack.moment + _outer(s, y)
         theta = self.law.step(state.theta.mT, gram.unsqueeze(-3), moment.mT, dt).mT  # column by column
         return Identified(theta, stack)

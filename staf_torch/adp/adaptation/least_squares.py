@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ...numerics.checks import non_negative, one_or_each, positive, positive_real, real, vector
+from ...numerics.riccati import measured
 from .windows import Equation
 
 
@@ -19,6 +20,7 @@ class Estimate(NamedTuple):
     covariance: Tensor  # (..., p, p)
     surprise: Tensor  # (...) largest innovation of the last equation, in its standard deviations
     resets: Tensor  # (...) how often the covariance was opened again
+    missed: Tensor | None = None  # (...) equations with a row that was not finite, where counted
 
     def recorded(self) -> dict[str, Tensor]:
         """Return the parts that a `LoopResult` keeps."""
@@ -28,11 +30,12 @@ class Estimate(NamedTuple):
 class LeastSquares:
     """theta^ of the equations S theta = z + noise by recursive least squares, one row of S after the other:
 
-        k = P s / (s'P s + r),   theta^ += k (z - s'theta^),   P -= k s'P,
+        k = P s / (s'P s + r),   theta^ += k (z - s'theta^),   P = (I - k s') P (I - k s')' + r k k',
 
     with the noise's variance r of the equation and ``floor``^2 more. Between equations P grows at the rate
     ``forgetting``, up to its first trace. Where an innovation exceeds ``alarm`` standard deviations the plant
-    is another one: P opens to its first size again, and the old data are forgotten at once.
+    is another one: P opens to its first size again, and the old data are forgotten at once. A row of S or z
+    that is not finite, as of a missing measurement, is left out and counted: `Estimate.missed`.
 
     Example:
         >>> from staf_torch.adp.adaptation.windows import Equation
@@ -86,7 +89,8 @@ class LeastSquares:
         lead, p = x.shape[:-1], len(self.first)
         start = self.first.to(x).expand(*lead, p).clone() if theta is None else theta.to(x)
         zero = x.new_zeros(lead)
-        return Estimate(start, self.prior.to(x).expand(*lead, p, p).clone(), zero, zero.clone())
+        prior = self.prior.to(x).expand(*lead, p, p).clone()
+        return Estimate(start, prior, zero, zero.clone(), zero.clone())
 
     def step(self, state: Estimate, equation: Equation, dt: float) -> Estimate:
         """The estimate with an equation, where it is ready.
@@ -97,6 +101,9 @@ class LeastSquares:
             dt: s since the step before.
         """
         theta, p, ready = state.theta, state.covariance, equation.ready
+        equation, fine = equation.finite()
+        missed = torch.zeros_like(state.resets) if state.missed is None else state.missed
+        missed = missed + (ready & ~fine.all(-1)).to(missed)
         prior = self.prior.to(theta)
         if self.forgetting:
             grown = p * (1 + self.forgetting * dt)
@@ -116,7 +123,7 @@ class LeastSquares:
         for row in range(equation.s.shape[-2]):
             s, z = equation.s[..., row, :], equation.z[..., row]
             ps = (p * s.unsqueeze(-2)).sum(-1)
-            gain = torch.where(ready, 1 / ((ps * s).sum(-1) + noise), 0.0)
+            gain = torch.where(ready & fine[..., row], 1 / ((ps * s).sum(-1) + noise), 0.0)
             theta = theta + (gain * (z - (s * theta).sum(-1))).unsqueeze(-1) * ps
-            p = p - gain[..., None, None] * ps.unsqueeze(-1) * ps.unsqueeze(-2)
-        return Estimate(theta, p, surprise, resets)
+            p = measured(p, gain.unsqueeze(-1) * ps, s, noise)
+        return Estimate(theta, p, surprise, resets, missed)

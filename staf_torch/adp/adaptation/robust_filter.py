@@ -9,8 +9,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ...lanes.tree import flatten, unflatten
 from ...numerics.checks import fail, positive_real, vector
 from ..loop.controller import Carried, Controller
+from ..planning.ddp import chosen
 from ..safety.quadratic_program import nearest_admissible
 from ..safety.safety_filter import Constraint, SafetyFilter, listed
 from .least_squares import Estimate, LeastSquares
@@ -41,6 +43,10 @@ class RobustFilter(Controller):
     with s the standard deviations of the estimate and ``low``, ``high`` what was known before. The condition
     of `SafetyFilter` is asked at the corners of that box and the largest demand counts; it is affine in theta
     up to the length of a hold where inputs act in a known way. As the estimate sharpens, the filter lets go.
+
+    Where a measured state has a NaN no condition can be asked: the control is held, nothing is learned, and
+    the result records how often so far as ``missed``. The controller's own carried state stays as it was,
+    unless it gave a control without the state.
 
     Example:
         >>> def regressor(x, u):  # a trolley with unknown friction
@@ -125,10 +131,13 @@ class RobustFilter(Controller):
 
     def recorded(self, carried: Guarded) -> dict[str, Tensor]:
         own = {name: getattr(carried, name) for name in Guarded._fields[-3:]}
+        own["missed"] = carried.window.missed
         return {**self.controller.recorded(carried.inner), **carried.estimate.recorded(), **own}
 
     def step(self, x: Tensor, now: Guarded, uniform: Tensor, dt: float) -> tuple[Tensor, Guarded]:
+        missing = x.isnan().any(-1)
         wanted, inner = self.controller.step(x, now.inner, uniform, dt)
+        inner = _kept(missing & ~torch.isfinite(wanted).all(-1), now.inner, inner)
         window, equation = self.windows.step(now.window, x, dt)
         estimate = self.law.step(now.estimate, equation, dt)
         u, h, slack = self._restrained(x, wanted, now.time, estimate)
@@ -136,6 +145,8 @@ class RobustFilter(Controller):
             u = self.plant.bounds.clip(u)
         acted = (u != wanted).any(-1).to(x)
         least, most = torch.minimum(now.least_margin, h), torch.maximum(now.largest_slack, slack)
+        before = now.window.u, now.least_margin, now.largest_slack, torch.zeros_like(acted)
+        u, least, most, acted = chosen(missing, before, (u, least, most, acted))
         window = self.windows.holding(window, u)
         return u, Guarded(inner, estimate, window, now.time + dt, least, most, now.acted + acted)
 
@@ -171,3 +182,9 @@ class RobustFilter(Controller):
             u, slack = nearest.point, nearest.shortfall
         assert met is not None
         return torch.where(met.unsqueeze(-1), wanted, u), margin, torch.where(met, 0.0, slack)
+
+
+def _kept(rows: Tensor, before: Carried, after: Carried) -> Carried:
+    """What was carried before in ``rows`` (B,), what is carried after in the others."""
+    (old, _), (new, structure) = flatten(before), flatten(after)
+    return unflatten(structure, iter(chosen(rows, tuple(old), tuple(new))))

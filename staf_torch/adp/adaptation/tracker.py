@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ...numerics.angles import wrap
 from ...numerics.checks import choice, fail
 from ..loop.controller import Controller
 from .history_stack import ConcurrentGradient, HistoryStack, Stack
@@ -37,7 +38,9 @@ class ConcurrentTracker(Controller):
         theta^' = Gam (Y'(x - xd) + k_CL sum_j S_j' (z_j - S_j theta^)),
 
     with equations S theta = z from windows of measured states, of which a `HistoryStack` keeps the best.
-    Each row may have gains of its own.
+    Each row may have gains of its own. x - xd is in [-pi, pi] for angles of the plant. Where a measured state
+    has a NaN the control is held, the stack alone is learned from, and the result records how often so far as
+    ``missed``.
 
     Example:
         >>> def regressor(z, u):  # x' = theta sin x + u
@@ -98,7 +101,8 @@ class ConcurrentTracker(Controller):
         longest = float(self.gains[3].max())
         made = IntegralWindows if source == "integral" else SlopeWindows
         self.windows: Windows = made(plant, longest)
-        p = plant.parameters_count
+        p, n = plant.parameters_count, plant._size()
+        self.angles = tuple(index % n for index in plant.periodic if index % n < plant.inputs)
         self.stack = HistoryStack(len(plant.rows), p, size)
         self.first = torch.zeros(p).double() if first is None else torch.tensor(first, dtype=torch.float64)
 
@@ -108,17 +112,19 @@ class ConcurrentTracker(Controller):
         return Tracking(theta, feedback, gain, rate, self.windows.init(x0, length), self.stack.init(x0))
 
     def recorded(self, carried: Tracking) -> dict[str, Tensor]:
-        return {"theta": carried.theta}
+        return {"theta": carried.theta, "missed": carried.window.missed}
 
     def step(self, x: Tensor, now: Tracking, uniform: Tensor, dt: float) -> tuple[Tensor, Tracking]:
         m = self.plant.inputs
         window, equation = self.windows.step(now.window, x, dt)
         stack = self.stack.step(now.stack, equation)
         wanted, wanted_rate = self.reference(x)
-        error = x[..., :m] - wanted
+        missing = x.isnan().any(-1)
+        error = wrap(x[..., :m] - wanted, self.angles)
         y = self.plant.regressor(x, torch.zeros_like(error))[..., :m, :]
-        push = (y * error.unsqueeze(-1)).sum(-2)
+        push = torch.where(missing.unsqueeze(-1), 0.0, (y * error.unsqueeze(-1)).sum(-2))
         theta = ConcurrentGradient(now.gain, now.rate).step(now.theta, stack.gram, stack.moment, dt, push)
         u = wanted_rate - (y * theta.unsqueeze(-2)).sum(-1) - now.feedback.unsqueeze(-1) * error
+        u = torch.where(missing.unsqueeze(-1), now.window.u, u)
         window = self.windows.holding(window, u)
         return u, now._replace(theta=theta, window=window, stack=stack)

@@ -22,21 +22,37 @@ class Equation(NamedTuple):
     variance: Tensor  # (...) of the noise of every entry of z
     ready: Tensor  # (...) bool: whether there is one at this time
 
+    def finite(self) -> tuple[Equation, Tensor]:
+        """The equation with zeros in rows that are not finite, or whose squares are not, and which rows are:
+        (..., r) bool."""
+        several = self.z.dim() == self.s.dim()  # right-hand sides
+        known = torch.isfinite(self.z.square())
+        fine = torch.isfinite(self.s.square().sum(-1)) & (known.all(-1) if several else known)
+        there = fine.unsqueeze(-1)
+        z = torch.where(there if several else fine, self.z, 0.0)
+        return self._replace(s=torch.where(there, self.s, 0.0), z=z), fine
+
 
 class Window(NamedTuple):
     """Window so far: integrals, or of `SlopeWindows` Y and h in its middle."""
 
-    x: Tensor  # (..., n) the state that was measured last; of `SlopeWindows` at the beginning
+    x: Tensor  # (..., n) the state that was measured last
     u: Tensor  # (..., m) the input held since
     s: Tensor  # (..., r, p)
     z: Tensor  # (..., r)
     elapsed: Tensor  # (...) s; -1 before the first measurement
     length: Tensor  # (...) s of this window
     longest: Tensor  # (...) s
+    moved: Tensor  # (..., n) the way since the window's beginning, of `SlopeWindows` alone
+    missed: Tensor  # (...) measurements that were missing so far
 
 
 class Windows(abc.ABC):
-    """Equations S theta = z, one a window of time."""
+    """Equations S theta = z, one a window of time.
+
+    A measurement with an entry that is NaN is missing: it ends its window without an equation, the next one
+    begins with the next measurement, and `Window.missed` counts it.
+    """
 
     model: ParametricPlant
     first: float  # s, length of the first window
@@ -58,6 +74,8 @@ class Windows(abc.ABC):
             x.new_full(lead, -1.0),
             x.new_full(lead, self.first) if length is None else length.to(x),
             x.new_full(lead, self.length) if length is None else length.to(x),
+            torch.zeros_like(x),
+            x.new_zeros(lead),
         )
 
     @abc.abstractmethod
@@ -66,7 +84,7 @@ class Windows(abc.ABC):
 
         Args:
             state: until the measurement before.
-            x: (..., n), measured now.
+            x: (..., n), measured now; NaN where it was not.
             dt: s since the measurement before.
         """
 
@@ -135,7 +153,7 @@ class IntegralWindows(Windows):
         self.noise = real("IntegralWindows", "noise", noise)
 
     def step(self, state: Window, x: Tensor, dt: float) -> tuple[Window, Equation]:
-        x = x if self.states is None else self.states(x)
+        x, missing = _known(x if self.states is None else self.states(x), state)
         begun = state.elapsed >= 0
         share = self._weight(state, dt) if self.smooth else torch.ones_like(state.elapsed)
         share = torch.where(begun, share, 0.0)
@@ -146,16 +164,15 @@ class IntegralWindows(Windows):
         whole_s = state.s + half[..., None, None] * s[..., rows, :]
         whole_z = state.z + (share.unsqueeze(-1) * moved - half.unsqueeze(-1) * h)[..., rows]
         elapsed = torch.where(begun, state.elapsed + dt, 0.0)
-        ready = elapsed > state.length - 0.5 * dt
-        kept = (~ready).to(x)
-        after = Window(
-            x,
-            state.u,
-            kept[..., None, None] * whole_s,
-            kept.unsqueeze(-1) * whole_z,
-            kept * elapsed,
-            torch.where(ready, torch.minimum(2 * state.length, state.longest), state.length),
-            state.longest,
+        ready = ~missing & (elapsed > state.length - 0.5 * dt)
+        kept = (~ready & ~missing).to(x)
+        after = state._replace(
+            x=x,
+            s=kept[..., None, None] * whole_s,
+            z=kept.unsqueeze(-1) * whole_z,
+            elapsed=torch.where(missing, -1.0, kept * elapsed),
+            length=torch.where(ready, torch.minimum(2 * state.length, state.longest), state.length),
+            missed=state.missed + missing.to(x),
         )
         return after, Equation(whole_s, whole_z, self._variance(state, dt), ready)
 
@@ -195,6 +212,7 @@ class SlopeWindows(Windows):
         self.first = self.length = positive_real("SlopeWindows", "length", length)
 
     def step(self, state: Window, x: Tensor, dt: float) -> tuple[Window, Equation]:
+        x, missing = _known(x, state)
         begun = state.elapsed >= 0
         elapsed = torch.where(begun, state.elapsed + dt, 0.0)
         half = 0.5 * state.length
@@ -202,9 +220,22 @@ class SlopeWindows(Windows):
         rows = self.model.rows
         s = torch.where(middle[..., None, None], self.model.regressor(x, state.u)[..., rows, :], state.s)
         h = torch.where(middle.unsqueeze(-1), self.model.rest_of(x, state.u)[..., rows], state.z)
-        ready = begun & (elapsed > state.length - 0.5 * dt)
-        slope = self.model.difference(x, state.x)[..., rows] / elapsed.clamp(min=dt).unsqueeze(-1)
+        ready = ~missing & begun & (elapsed > state.length - 0.5 * dt)
+        moved = state.moved + self.model.difference(x, state.x)  # step by step: an angle may turn meanwhile
+        slope = moved[..., rows] / elapsed.clamp(min=dt).unsqueeze(-1)
         begins = ~begun | ready
-        first, since = torch.where(begins.unsqueeze(-1), x, state.x), torch.where(begins, 0.0, elapsed)
-        after = state._replace(x=first, s=s, z=h, elapsed=since)
+        after = state._replace(
+            x=x,
+            s=s,
+            z=h,
+            elapsed=torch.where(missing, -1.0, torch.where(begins, 0.0, elapsed)),
+            moved=torch.where(begins.unsqueeze(-1), 0.0, moved),
+            missed=state.missed + missing.to(x),
+        )
         return after, Equation(s, slope - h, torch.zeros_like(elapsed), ready)
+
+
+def _known(x: Tensor, state: Window) -> tuple[Tensor, Tensor]:
+    """The measurement, where it is missing the one before, (..., n), and where that is, (...) bool."""
+    missing = x.isnan().any(-1)
+    return torch.where(missing.unsqueeze(-1), state.x, x), missing

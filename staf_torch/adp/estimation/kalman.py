@@ -86,7 +86,7 @@ class KalmanFilter(abc.ABC):
         moved = self.predicted(belief, dt)
         mean = torch.where(first.unsqueeze(-1), belief.mean, moved.mean)
         covariance = torch.where(first[..., None, None], belief.covariance, moved.covariance)
-        return self.corrected(belief._replace(mean=mean, covariance=covariance), y)
+        return self.corrected(moved._replace(mean=mean, covariance=covariance), y)
 
     @abc.abstractmethod
     def predicted(self, belief: Belief, dt: float) -> Belief:
@@ -100,9 +100,12 @@ class KalmanFilter(abc.ABC):
         """y - seen, of outputs that are angles by the shorter way around: (..., q), (..., q) -> (..., q)."""
         return wrap_each(y - seen, self.periods)
 
-    def counted(self, belief: Belief, y: Tensor) -> Tensor | None:
-        """`Belief.missed` after a measurement (..., q)."""
-        return None if belief.missed is None else belief.missed + y.isnan().to(belief.missed)
+    def counted(self, belief: Belief, y: Tensor | None = None) -> Tensor:
+        """`Belief.missed` after a measurement (..., q), or after none."""
+        before = belief.missed
+        if before is None:
+            before = belief.mean.new_zeros(*belief.mean.shape[:-1], len(self.noise))
+        return before if y is None else before + y.isnan().to(before)
 
     def moved(self, x: Tensor, u: Tensor, dt: float) -> Tensor:
         """x after dt seconds with u held: (..., n), (..., m) -> (..., n)."""
@@ -143,7 +146,7 @@ class ExtendedKalman(KalmanFilter):
 
         mean, slope = row_jacobian(step, belief.mean)
         covariance = product(product(slope, belief.covariance), slope.mT)
-        return belief._replace(mean=mean, covariance=covariance + self.disturbance(mean, dt))
+        return Belief(mean, covariance + self.disturbance(mean, dt), belief.u, self.counted(belief))
 
     def corrected(self, belief: Belief, y: Tensor) -> Belief:
         mean, covariance = belief.mean, belief.covariance
@@ -186,7 +189,7 @@ class UnscentedKalman(KalmanFilter):
         held = belief.u.unsqueeze(-2).expand(*points.shape[:-1], -1)
         mean, away = _mean(self.moved(points, held, dt), weights, self.model.difference)
         spread = product((weights * away).mT, away)
-        return belief._replace(mean=mean, covariance=spread + self.disturbance(mean, dt))
+        return Belief(mean, spread + self.disturbance(mean, dt), belief.u, self.counted(belief))
 
     def corrected(self, belief: Belief, y: Tensor) -> Belief:
         points, weights = self._points(belief)
