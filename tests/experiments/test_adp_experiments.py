@@ -120,6 +120,27 @@ def test_the_held_radius_is_that_of_the_linear_loop_with_its_gain() -> None:
     assert held_radius(problem, result) == pytest.approx(expected, rel=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("experiment", "differs", "learns"),
+    [
+        ("adp", "adp.law Information (print: Published)", True),
+        ("adp_as_printed", None, True),
+        ("adp adp/policy=lqr", None, False),
+        ("adp adp/policy=none", None, False),
+        ("adp_three_state", None, False),
+    ],
+)
+def test_a_run_says_what_is_not_as_printed_and_why_it_pays_more_than_the_optimum(
+    experiment: str, differs: str | None, learns: bool, tmp_path: Path
+) -> None:
+    short = ("duration=0.02", "dt=0.002", "figures=false", "adp.optimum.shooting=false", "adp.compile=false")
+    said = run(tmp_path, *f"experiment={experiment}".split(), *short).log
+    assert ("not as the paper prints it" in said) == (differs is not None)
+    assert differs is None or differs in said
+    assert differs is None or "experiment=adp_as_printed" in said
+    assert learns or "while the weights are learned" not in said
+
+
 def test_trajectories_that_do_not_come_to_rest_are_counted(caplog: pytest.LogCaptureFixture) -> None:
     plant, cost = systems.VanDerPol(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
     x0 = tensor([[2.0, 0.0], [0.0, -1.5], [0.0, 0.0]])
