@@ -62,7 +62,7 @@ class FilterCall(ctypes.Structure):
         ("mean", ctypes.c_void_p),
         ("deviation", ctypes.c_void_p),
         ("functions", FunctionPointers),
-        *((name, ctypes.c_double) for name in ("slack2", "robust", "base", "tiny", "most", "limit")),
+        *((name, ctypes.c_double) for name in ("slack2", "robust", "base", "tiny", "most")),
     )
 
 
@@ -86,7 +86,6 @@ class CompiledFilter:
         self._call.slack2, self._call.robust = definition.slack**2, definition.robust
         numbers = torch.finfo(state.dtype)
         self._call.base, self._call.tiny, self._call.most = definition.base, numbers.eps**0.5, numbers.max
-        self._call.limit = numbers.max**0.75
         self._run, self._pointer = call, ctypes.byref(self._call)
         self._shape = (streams, state.outputs)
 

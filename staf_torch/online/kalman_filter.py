@@ -11,9 +11,12 @@ from torch import Tensor
 
 from .local_functions import LocalFunctions
 
-SURPRISE = 25.0  # standardised squared errors count at most so many times their running mean
+SURPRISE = 25.0  # squared errors count at most so many times their running mean, each in a row so many more
 LANES = 8  # streams whose numbers stand together: the double precision numbers of a vector register
 ERROR_RATE = 0.05  # at which that mean follows: the latest twenty samples or so
+SPREAD_RATE = 1e-3  # at which the mean and the spread of y follow
+LEAST = 1e-3  # of the spread of y: the amplitude of V that the errors say is no less
+NOVEL = 4.0  # times its running mean, a share that is unknown says that x is away from the stream
 STREAK = 8  # samples in a row that are out of all proportion before a stream starts afresh
 
 
@@ -22,12 +25,14 @@ class StreamState:
     """State of every stream, changed in place; streams are the last dimension.
 
     u is the mean of the weights, I - D their covariance: D, 0 <= D <= I, is what has been learned. The rows
-    of the table: the anchor, x as last measured, u output by output, D's lower triangle row by row, and for
-    every output the running mean of its squared standardised errors; then the largest |y| learned. In memory
-    the numbers of `LANES` streams stand together, so that machine code reads them one after the other.
+    of the table: the anchor, x as last measured, u output by output and of an output that is always 1, D's
+    lower triangle row by row; for every output the root mean square of its standardised errors, how many in
+    a row were a surprise, how many were counted, mean and spread of y, its leaps in a row; then the running share of V that was
+    unknown, and the largest |y| learned. In memory the numbers of `LANES` streams stand together, so that
+    machine code reads them one after the other.
     """
 
-    blocks: Tensor  # (ceil(S / LANES), 2 n + K M + M (M + 1) / 2 + K + 1, LANES)
+    blocks: Tensor  # (ceil(S / LANES), 2 n + (K + 1) M + M (M + 1) / 2 + 6 K + 2, LANES)
     counts: Tensor  # learned, skipped, out of proportion in a row, learned since it began: (4, S) int64
     dim: int  # n
     count: int  # M
@@ -36,8 +41,7 @@ class StreamState:
     @classmethod
     def empty(cls, like: Tensor, streams: int, dim: int, count: int, outputs: int) -> StreamState:
         """Nothing learned, at NaN: a stream's first sample puts it somewhere."""
-        rows = 2 * dim + outputs * count + count * (count + 1) // 2 + outputs + 1
-        table = like.new_zeros(rows, streams)
+        table = like.new_zeros(rows_of(dim, count, outputs), streams)
         table[: 2 * dim] = torch.nan
         counts = torch.zeros(4, streams, dtype=torch.int64, device=like.device)
         return cls(_blocks(table), counts, dim, count, outputs)
@@ -79,11 +83,12 @@ class StreamState:
     def parts(self, table: Tensor) -> StateParts:
         """The rows of a table (..., S) by name: views, but for D."""
         n, m, k = self.dim, self.count, self.outputs
-        anchor, last, mean, lower, errors, largest = table.split([n, n, k * m, m * (m + 1) // 2, k, 1])
+        sizes = [n, n, (k + 1) * m, m * (m + 1) // 2, *[k] * 6, 1, 1]
+        anchor, last, mean, lower, *rest = table.split(sizes)
         row, column = torch.tril_indices(m, m, device=table.device)
         learned = table.new_empty(m, m, *table.shape[1:])
         learned[row, column] = learned[column, row] = lower
-        return StateParts(anchor, last, mean.unflatten(0, (k, m)), learned, errors, largest)
+        return StateParts(anchor, last, mean.unflatten(0, (k + 1, m)), learned, *rest)
 
     def whole(self, parts: StateParts) -> Tensor:
         """The table with these rows."""
@@ -99,7 +104,7 @@ class StreamState:
     @property
     def mean(self) -> Tensor:
         """u, (K, M, S)."""
-        return self.parts(self.table).mean
+        return self.parts(self.table).mean[:-1]
 
     @property
     def learned(self) -> Tensor:
@@ -112,10 +117,25 @@ class StateParts(NamedTuple):
 
     anchor: Tensor  # (n, S)
     last: Tensor  # (n, S)
-    mean: Tensor  # (K, M, S)
+    mean: Tensor  # u, and behind it that of an output that is always 1, (K + 1, M, S)
     learned: Tensor  # (M, M, S)
-    errors: Tensor  # (K, S)
+    errors: Tensor  # root mean square in units of the deviation that was predicted, (K, S)
+    surprises: Tensor  # in a row, (K, S)
+    told: Tensor  # errors that were counted: those since y took a second value, (K, S)
+    level: Tensor  # running mean of y, (K, S)
+    spread: Tensor  # running deviation of y from it, (K, S)
+    leaps: Tensor  # in a row, of y from it, (K, S)
+    usual: Tensor  # running share of the variance of V that was unknown at x, (1, S)
     largest: Tensor  # (1, S)
+
+
+class _Outlook(NamedTuple):
+    """What is expected of the next y."""
+
+    mean: Tensor  # (K, S)
+    deviation: Tensor  # (K, S)
+    weight: Tensor  # of its square, what the amplitude makes that the errors say, (K, S)
+    unknown: Tensor  # share of the variance of V, (S,)
 
 
 class _NewSample(NamedTuple):
@@ -126,20 +146,28 @@ class _NewSample(NamedTuple):
     seen: Tensor  # whether it was, (K, S)
     lapse: Tensor  # (S,)
     fine: Tensor  # whether the stream learns, (S,)
-    moved: Tensor  # whether its centers have moved to x, and what follows is a number, (K, S)
-    before: Tensor  # squared errors in units of the variance predicted before they did, (K, S)
+    before: _Outlook  # before the centers moved
     most: float  # the largest number of the table
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LocalFilter:
-    """y_k = V_k(x_k) + e_k, e ~ N(0, rho), with V a Gaussian process of unit amplitude around the state.
+    """y_k = m + V_k(x_k) + e_k, e ~ N(0, rho), V a Gaussian process of unit amplitude around the state.
 
     A sample: P <- I - lambda D (what was learned fades towards the prior), then the Kalman update; a
-    prediction is of a sample one unit of time after the latest, with lambda D. Variances are multiplied by
-    the running mean of squared errors in units of the variance that was predicted for them. When the
-    state has left the anchor the centers move there, u <- T u and D <- T D T', |T| <= 1: D can only shrink,
-    so that no covariance winds up in directions that the stream does not visit. K outputs share D.
+    prediction is of a sample one unit of time after the latest, with lambda D. When the state has left the
+    anchor the centers move there, u <- T u and D <- T D T', |T| <= 1: D can only shrink, so that no covariance
+    winds up in directions that the stream does not visit. K outputs share D.
+
+    m is the running mean of y. As the filter is linear, a second mean u1, of an output that is always 1, makes
+    it exact whatever m becomes: the prediction is psi'u + m (1 - psi'u1).
+
+    The noise and the prior have scales of their own. On the stream the variance r + rho of a prediction, r the
+    share of V's that is unknown, is multiplied by c^2, the running mean of the squared errors in these units.
+    Away from it, where r is beyond some times its running mean, the variance goes over to that of y as r goes
+    to 1. Of an error there, c learns by the share of the variance that it makes (the expectation step of
+    Dempster, Laird and Rubin, 1977). Until y takes a second value nothing is known of its size, and
+    ``base`` says it.
 
     A coordinate that is NaN was not measured and is held; a target that is NaN is not learned. A sample whose
     |y| is 1/sqrt(eps) times the largest so far, or whose local functions overflow, is skipped; a stream that
@@ -168,29 +196,31 @@ class LocalFilter:
 
     def predict(self, state: StreamState, x: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of the next y at x (S, n): (S, K), (S, K)."""
-        mean, variance = self.moments(state, x)
-        return mean, variance.sqrt()
-
-    def moments(self, state: StreamState, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and variance of the y at x (S, n) one unit of time later: (S, K), (S, K)."""
         old = state.parts(state.table.double())
         x = torch.where(torch.isnan(x.mT), old.last, x.mT.double())
-        mean, variance = self._moments(old, x - old.anchor, self.forgetting)
-        scale = self._scale(old.errors, state.counts[3])
+        found = self._outlook(old, x - old.anchor, self.forgetting)
         fresh = torch.isnan(old.anchor).any(0)  # nothing is known before the first sample
-        mean, variance = torch.where(fresh, 0.0, mean), variance * scale
-        variance = torch.where(fresh, (1 + self.ratio) * self.base, variance)
-        return mean.mT.to(state.blocks), variance.mT.to(state.blocks)
+        mean = torch.where(fresh, 0.0, found.mean)
+        deviation = torch.where(fresh, ((1 + self.ratio) * self.base).sqrt(), found.deviation)
+        return mean.mT.to(state.blocks), deviation.mT.to(state.blocks)
 
-    def _moments(self, old: StateParts, z: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean (K, S) and variance (S,) of the next y at z (n, S) from the anchor, before errors scale it;
-        when it comes, this share of D is left."""
+    def _outlook(self, old: StateParts, z: Tensor, share: Tensor) -> _Outlook:
+        """What is expected of y at z (n, S) from the anchor; when it comes, this share of D is left."""
         psi, log_factor = self.functions.local(old.anchor, z)
-        prior = self.functions.prior(old.anchor, z)
-        factor: Tensor | float = 1.0 if log_factor is None else log_factor.exp()
-        mean = (psi * old.mean).sum(-2) * factor
+        prior = torch.zeros_like(share) + self.functions.prior(old.anchor, z)
+        factor = torch.ones_like(share) if log_factor is None else log_factor.exp()
+        *means, one = ((psi * old.mean).sum(-2) * factor).unbind()
+        mean = torch.stack(means) + old.level * (1 - one)
         known = (psi * _apply(old.learned, psi)).sum(0)  # psi'D psi
-        return mean, (prior - share * known) * factor**2 + self.ratio
+        unknown = (1 - share * known / prior).clamp(0.0, 1.0)
+        usual = torch.minimum(NOVEL * old.usual[0], 1 - (1 - old.usual[0]) / 4)
+        away = ((unknown - usual) / (1 - usual).clamp(min=1e-9)).clamp(0.0, 1.0)
+        near = self._amplitude(old) * (torch.minimum(unknown, usual) * prior * factor**2 + self.ratio).sqrt()
+        far = torch.maximum(self._spread(old), near)
+        square = (near / far).square()
+        whole = away + (1 - away) * square
+        weight = torch.where(square < 1, (1 - away) * square / whole, 1.0)
+        return _Outlook(mean, far * whole.sqrt(), weight, unknown)
 
     def learn(self, state: StreamState, x: Tensor, y: Tensor, lapse: Tensor | None = None) -> None:
         """Learn one sample a stream, in place, computed in float64.
@@ -221,11 +251,8 @@ class LocalFilter:
 
         z = torch.where(fine & ~afresh, x - old.anchor, 0.0)
         moves = fine & (afresh | ((z * z).sum(0) > self.slack**2))
-        expected, variance = self._moments(old, z, self.forgetting**lapse)
-        before = (y - expected).square() / variance  # no number where a kernel overflows so far away
-        jumped = moves & ~afresh & torch.isfinite(before)
+        before = self._outlook(old, z, self.forgetting**lapse)
         anchor = torch.where(moves, x, old.anchor)
-        start = torch.where(afresh, 0.0, 1.0).double()
         left = torch.where(afresh, x, old.anchor)
         transfer, factor = self.functions.transfer(left, torch.where(moves, z, 0.0))
         mean = torch.where(moves, _apply(transfer, old.mean) * (1.0 if factor is None else factor), old.mean)
@@ -234,47 +261,95 @@ class LocalFilter:
         z = torch.where(moves, 0.0, z)
         since = torch.where(afresh, 0, since)
         held = torch.where(torch.isfinite(x), x, old.last)
-        largest = torch.where(afresh, 0.0, largest)[None]
-        moved = StateParts(anchor, held, mean * start, learned * start, old.errors * start, largest)
+        kept = old._replace(mean=mean, learned=learned)
+        moved = StateParts(anchor, held, *(torch.where(afresh, 0.0, part) for part in kept[2:]))
         most = torch.finfo(state.dtype).max
-        found, good = self._update(moved, since, _NewSample(z, y, seen, lapse, fine, jumped, before, most))
+        found, good = self._update(moved, since, _NewSample(z, y, seen, lapse, fine, before, most))
         faded = moved._replace(learned=moved.learned * self.forgetting**lapse)  # time passes in any case
-        kept = [torch.where(good, new, old_) for new, old_ in zip(found, faded, strict=True)]
-        state.put(state.whole(StateParts(*kept)))
+        both = [torch.where(good, new, old_) for new, old_ in zip(found, faded, strict=True)]
+        state.put(state.whole(StateParts(*both)))
         streak = torch.where(afresh & good, 0, streak)
         state.counts.copy_(torch.stack((samples + good, skipped + ~good, streak, since + good)))
 
-    def _update(self, old: StateParts, samples: Tensor, sample: _NewSample) -> tuple[StateParts, Tensor]:
+    def _update(self, old: StateParts, since: Tensor, sample: _NewSample) -> tuple[StateParts, Tensor]:
         """The Kalman update at z from the anchor; and the streams whose result is finite."""
-        z, y, seen, lapse, fine, moved, before, most = sample
+        z, y, seen, lapse, fine, before, most = sample
         (psi, log_factor), noise = self.functions.local(old.anchor, z), self.ratio
         largest = torch.maximum(old.largest, y.abs().amax(0))
         prior = torch.zeros_like(lapse) + self.functions.prior(old.anchor, z)
-        if log_factor is not None:
-            shrink = (-log_factor).exp()
-            y, noise = y * shrink, noise * shrink.square()
+        shrink = torch.ones_like(lapse) if log_factor is None else (-log_factor).exp()
+        noise = noise * shrink.square()
         share = self.forgetting**lapse
         known = _apply(old.learned, psi) * share
         spread = prior + noise - (psi * known).sum(0)
-        error = y - (psi * old.mean).sum(-2)
         gain = psi - known
-        square = torch.where(moved, before, error * error / spread).clamp(max=most)
-        limited = square.clamp(max=most**0.75)
-        scale = self._scale(old.errors, samples)
-        kept = (self.robust * (scale / square).sqrt()).clamp(max=1.0) if math.isfinite(self.robust) else 1.0
-        change = torch.where(seen, kept * error / spread, 0.0)
+        left = torch.cat((y * shrink, shrink[None])) - (psi * old.mean).sum(-2)
+        of_level = old.level * left[-1]
+        # nothing was expected of the first value, nor where a kernel overflows
+        expects = (old.told > 0) & torch.isfinite(before.mean) & torch.isfinite(before.deviation)
+        away = torch.where(expects, (y - before.mean).abs() / before.deviation, 0.0).clamp(max=1e150)
+        kept = torch.where(away > self.robust, self.robust / away, 1.0)
+        counts = torch.where(kept < 1, kept * (left[:-1] - of_level) + of_level, left[:-1])
+        change = torch.cat((torch.where(seen, counts, 0.0), left[-1:])) / spread
         mean = old.mean + gain * change.unsqueeze(-2)
+        first = seen & (old.told == 0)  # as if it had always been so
+        mean[:-1] = torch.where(first.unsqueeze(1), y.unsqueeze(1) * mean[-1], mean[:-1])
         learned = old.learned * share + gain.unsqueeze(1) * (gain / spread)
-        rate = (1 / (samples.double() + 1.0)).clamp(min=ERROR_RATE)
-        counted = torch.where(samples < STREAK, limited, torch.minimum(limited, SURPRISE * old.errors))
-        errors = torch.where(seen, old.errors + rate * (counted - old.errors), old.errors)
+        errors, surprises = self._errors(old, away, before.weight.nan_to_num(0.0))
+        level, deviation, leaps = self._running_spread(old, y)
+        told = torch.where((deviation > 0) | first, (old.told + 1).clamp(max=2 / SPREAD_RATE), old.told)
+        own = [
+            torch.where(seen, new.clamp(-most, most), old_)
+            for new, old_ in zip((errors, surprises, told, level, deviation, leaps), old[4:10], strict=True)
+        ]
+        rate = (1 / since.clamp(min=1).double()).clamp(min=ERROR_RATE)
+        usual = torch.where(since > 0, old.usual + rate * (before.unknown.nan_to_num(1.0) - old.usual), 0.0)
         good = fine & (spread > 0) & (mean.abs().amax((0, 1)) <= most) & torch.isfinite(learned.sum((0, 1)))
-        return StateParts(old.anchor, old.last, mean, learned, errors, largest), good
+        return StateParts(old.anchor, old.last, mean, learned, *own, usual, largest), good
 
-    def _scale(self, errors: Tensor, samples: Tensor) -> Tensor:
-        """Running residual variance in units of the predicted: the prior's at first, then what errors say."""
-        trust = samples.double().clamp(max=20) / 20.0
-        return (errors * trust + self.base * (1 - trust)).clamp(min=1e-6 * self.base)
+    def _errors(self, old: StateParts, away: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+        """Errors and surprises after an error of so many deviations."""
+        inside = (1 + weight * (away.square() - 1)).clamp(min=0.0)
+        counted = (self._amplitude(old) * inside.sqrt()).clamp(max=1e300)
+        limited, surprises = _limited(
+            counted, torch.maximum(old.errors, LEAST * self._spread(old)), old.surprises, old.told
+        )
+        rate = (1 / (old.told - 1).clamp(min=1.0)).clamp(min=ERROR_RATE)
+        errors = torch.hypot((1 - rate).sqrt() * old.errors, rate.sqrt() * limited)
+        return torch.where(old.told >= 2, errors, 0.0), surprises
+
+    def _running_spread(self, old: StateParts, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The running mean and deviation with another y. The first values may be outliers, and fade sooner."""
+        rate = torch.minimum(3 / (old.told + 3), 1 / (old.told - 40).clamp(min=1.0)).clamp(min=SPREAD_RATE)
+        size, leaps = _limited((y - old.level).abs(), self._spread(old), old.leaps, old.told)
+        step = torch.where(y < old.level, -size, size)
+        deviation = (1 - rate).sqrt() * torch.hypot(old.spread, rate.sqrt() * step)
+        return old.level + rate * step, deviation, leaps
+
+    def _amplitude(self, old: StateParts) -> Tensor:
+        """c: the prior's amplitude at first, then what errors say."""
+        trust = (old.told - 2).clamp(0.0, 20.0) / 20.0
+        found = torch.hypot(old.errors * trust.sqrt(), (self.base * (1 - trust)).sqrt())
+        return torch.maximum(found, LEAST * self._spread(old))
+
+    def _spread(self, old: StateParts) -> Tensor:
+        """Deviation of y, that of the prior where it has been constant."""
+        return torch.where(old.spread > 1e-15 * old.level.abs(), old.spread, self.base**0.5)
+
+
+def _limited(value: Tensor, running: Tensor, row: Tensor, told: Tensor) -> tuple[Tensor, Tensor]:
+    """A value, at most so many times its running size, each in a row so many more; and how many are in a row."""
+    step = math.sqrt(SURPRISE)
+    large = (told >= STREAK + 2) & (value > step * running)
+    most = step ** (1 + row) * running
+    return torch.where(large, torch.minimum(value, most), value), torch.where(
+        large, (row + 1).clamp(max=100.0), 0.0
+    )
+
+
+def rows_of(dim: int, count: int, outputs: int) -> int:
+    """Return the rows of the table of a `StreamState`."""
+    return 2 * dim + (outputs + 1) * count + count * (count + 1) // 2 + 6 * outputs + 2
 
 
 def _blocks(table: Tensor) -> Tensor:
@@ -328,9 +403,9 @@ def smooth_record(
         scaled = transfer if factor is None else transfer * factor[:, None, None]
         learned = old.learned.permute(2, 0, 1)
         share = (filter_.forgetting ** lapse[k])[:, None, None]
-        means.append(new.mean.permute(2, 1, 0))
+        means.append(new.mean[:-1].permute(2, 1, 0))
         covariances.append(eye - new.learned.permute(2, 0, 1))
-        expected.append(scaled @ old.mean.permute(2, 1, 0))
+        expected.append(scaled @ old.mean[:-1].permute(2, 1, 0))
         predicted.append(eye - share * transfer @ learned @ transfer.mT)
         transfers.append(scaled)
         anchors.append(new.anchor)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 import staf_torch as st
 from staf_torch.online.compiled_filter import CompiledFilter
-from staf_torch.online.kalman_filter import LocalFilter, StreamState
+from staf_torch.online.kalman_filter import LocalFilter, StateParts, StreamState
 from staf_torch.online.local_functions import LocalFunctions
 
 FUNCTIONS = LocalFunctions.of(st.GaussianKernel(0.8), 0.5 * st.rings(6))
@@ -96,7 +96,7 @@ def test_compiled_filter_is_its_definition(robust: float, dtype: torch.dtype) ->
         definition.learn(slow, at, told, lapse)
         assert torch.equal(fast.counts, slow.counts)
         for name, found, expected in zip(
-            ("anchor", "last", "mean", "learned", "errors", "largest"),
+            StateParts._fields,
             fast.parts(fast.table),
             slow.parts(slow.table),
             strict=True,

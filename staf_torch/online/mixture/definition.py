@@ -104,7 +104,7 @@ class BankDefinition:
         u = torch.cat((torch.ones(1, dtype=torch.float64), (x - center[:n]) / spread[:n]))
         line = (s["linear"] * u).sum(-1)
         process = self._local_processes(s, x, u[1:], line)
-        carried = self.filter.moments(self._filters(s), u[1:].expand(len(r.carried_forgetting), -1))
+        carried = self.filter.predict(self._filters(s), u[1:].expand(len(r.carried_forgetting), -1))
         latest = s["waiting_y" if float(s["waiting"]) == 1 else "last_y"]
         last = ((latest - center[n:]) / spread[n:])[:, None]
         common = (1 + (u * (s["covariance"] * u).sum(-1)).sum()).expand_as(last)
@@ -117,7 +117,12 @@ class BankDefinition:
         unknown = (tracked_spread - s["tracker_noise"]).clamp(max=1.0)
         tracked = tracked + unknown.square() * line[:, None]
         means = torch.cat((process[0], carried[0].mT, bent, tracked, line[:, None], last), 1)
-        own = (process[1], carried[1].mT, wide_of * s["quadratic_error"], tracked_spread.expand_as(tracked))
+        own = (
+            process[1],
+            carried[1].mT.square(),
+            wide_of * s["quadratic_error"],
+            tracked_spread.expand_as(tracked),
+        )
         variances = torch.cat((*own, common, torch.ones_like(last)), 1)
         ends = torch.minimum(s["low"], latest), torch.maximum(s["high"], latest)
         low, high = ((end - center[n:]) / spread[n:] for end in ends)

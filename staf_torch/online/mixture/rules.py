@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 from torch import Tensor
 
+from ..kalman_filter import rows_of
+
 LOCAL, CARRIED, QUADRATIC, TRACKERS = 24, 8, 8, 8
 MEMBERS = LOCAL + CARRIED + QUADRATIC + TRACKERS + 2  # ... and the linear model, the last value
 CLOCKS, BLENDS = 3, 4
@@ -123,7 +125,7 @@ class Rules(NamedTuple):
 def layout(shape: BankShape) -> list[tuple[str, tuple[int, ...]]]:
     """Return names and shapes of a stream's numbers, in the order of `Stream` in _bank.hpp."""
     n, k, c, d = shape.dim, shape.outputs, shape.capacity, shape.features
-    filters = 2 * n + k * (n + 1) + (n + 1) * (n + 2) // 2 + k + 2
+    filters = rows_of(n, n + 1, k) + 1
     return [
         *((name, ()) for name in ("clock", "count", "far", "skipped", "learned", "time")),
         *(("last_x", (n,)), ("last_y", (k,)), ("asked", (n,)), ("answered", ())),

@@ -19,7 +19,7 @@ static Filter filters_of(const Stream &s) {
     return f;
 }
 static Law law_of(const Rules &r) {
-    Law law{all(r.carried_ratio), V{}, all(square(r.carried_slack)), all(infinity), all(1), 0, std::numeric_limits<double>::max(), 1e231};
+    Law law{all(r.carried_ratio), V{}, all(square(r.carried_slack)), all(infinity), all(1), 0, std::numeric_limits<double>::max()};
     for (int l = 0; l < lanes; ++l) law.forgetting[l] = r.carried_forgetting[l];
     return law;
 }
@@ -118,15 +118,14 @@ static void carry(const Rules &r, Stream &s, const double *x, const double *y, d
     s.trackers.learn(tracker_rules(r, s), place, value, after(s.tracker_forgetting));
     const Verdict verdict = judge(law, f, at, value, seen, V{});
     for (int i = 0; i < n; ++i) z[i] = verdict.moves ? V{} : verdict.z[i];
-    V before[K];
+    V before[K + 2];
     if (any(verdict.moves)) {
         const V known = moments(r.functions, verdict.z, f.mean, [&](int i) { return f.learned[i]; }, before);
-        const V variance = 1. + law.ratio - after(law.forgetting) * known;
-        for (int o = 0; o < K; ++o) before[o] = (value[o] - before[o]) * (value[o] - before[o]) / variance;
+        before[K + 1] = 1. - after(law.forgetting) * known;
         Filter moved = f;
         transfer(r.functions, verdict.z, moved.mean, moved.learned);
         for (int i = 0; i < n; ++i) f.anchor[i] = verdict.moves ? at[i] : f.anchor[i];
-        for (int o = 0; o < K; ++o)
+        for (int o = 0; o <= K; ++o)
             for (int i = 0; i < M; ++i)
                 f.mean[o][i] = verdict.moves ? (verdict.afresh ? V{} : moved.mean[o][i]) : f.mean[o][i];
         for (int i = 0; i < M * (M + 1) / 2; ++i)
@@ -224,7 +223,7 @@ static void ask(const Rules &r, Stream &s, const double *x) {
     for (int i = 0; i < unknowns; ++i)
         for (int j = 0; j < unknowns; ++j) spread += u[i] * s.covariance[i][j] * u[j];
     local_processes(r, s, x, u + 1, line);
-    V at[n], place[n], mean[K], variance[K], bent[K], tracked[K];
+    V at[n], place[n], mean[K], deviation[K], bent[K], tracked[K];
     double phi[features];
     quadratic_features(u + 1, phi);
     const V bent_spread = s.quadratics.predict(phi, bent);
@@ -233,10 +232,10 @@ static void ask(const Rules &r, Stream &s, const double *x) {
     const V tracked_spread = s.trackers.predict(tracker_rules(r, s), place, tracked);
     const V unknown = minimum(tracked_spread - s.tracker_noise, all(1));
     const Filter f = filters_of(s);
-    predict(r.functions, law_of(r), f, [&](int i) { return f.learned[i]; }, at, mean, variance);
+    predict(r.functions, law_of(r), f, [&](int i) { return f.learned[i]; }, at, mean, deviation);
     for (int o = 0; o < K; ++o) {
         double *means = s.means[o], *variances = s.variances[o];
-        for (int l = 0; l < carried; ++l) means[locals + l] = mean[o][l], variances[locals + l] = variance[o][l];
+        for (int l = 0; l < carried; ++l) means[locals + l] = mean[o][l], variances[locals + l] = square(deviation[o][l]);
         for (int l = 0; l < lanes; ++l) {
             means[locals + carried + l] = bent[o][l];
             variances[locals + carried + l] = bent_spread[l] * s.quadratic_error[o][l];

@@ -11,11 +11,11 @@ struct Call {
     const double *ratio, *forgetting;  // (streams)
     REAL *mean, *deviation;         // (streams, K)
     Functions functions;
-    double slack2, robust, base, tiny, most, limit;
+    double slack2, robust, base, tiny, most;
 };
 constexpr int tile = 64;  // streams that are worked on together stay in the cache
-constexpr int row_mean = 2 * n, row_learned = row_mean + K * M, row_errors = row_learned + M * (M + 1) / 2;
-constexpr int rows_of_all = row_errors + K + 1;
+constexpr int row_mean = 2 * n, row_learned = row_mean + (K + 1) * M, row_errors = row_learned + M * (M + 1) / 2;
+constexpr int rows_of_all = row_errors + 6 * K + 2, expectations = K + 2;
 
 typedef REAL Stored __attribute__((vector_size(lanes * sizeof(REAL))));
 INLINE REAL *block_of(const Call &call, int64_t first) { return call.table + first * rows_of_all; }
@@ -81,17 +81,16 @@ INLINE void read(const Call &call, int64_t first, int count, Filter &s) {
     auto next = [&] { return load(at + (row++) * lanes); };
     for (int i = 0; i < n; ++i) s.anchor[i] = next();
     for (int i = 0; i < n; ++i) s.last[i] = next();
-    for (int o = 0; o < K; ++o)
+    for (int o = 0; o <= K; ++o)
         for (int i = 0; i < M; ++i) s.mean[o][i] = next();
     row = row_errors;
-    for (int o = 0; o < K; ++o) s.errors[o] = next();
-    s.largest = next();
+    for (V *part = s.errors; part <= &s.largest; ++part) *part = next();
     s.since = count_of(call, 3, first, count);
 }
 
 INLINE Law law_of(const Call &call, int64_t first, int count) {
     const V ratio = column(call.ratio + first, 1, count), forgetting = column(call.forgetting + first, 1, count);
-    return {ratio, forgetting, all(call.slack2), all(call.robust), all(call.base), call.tiny, call.most, call.limit};
+    return {ratio, forgetting, all(call.slack2), all(call.robust), all(call.base), call.tiny, call.most};
 }
 
 static void tell(const Call &call) {
@@ -100,30 +99,30 @@ static void tell(const Call &call) {
         Filter s;
         read(call, first, count, s);
         const REAL *learned = block_of(call, first) + row_learned * lanes;
-        V x[n], mean[K], variance[K];
+        V x[n], mean[K], deviation[K];
         for (int i = 0; i < n; ++i) x[i] = column(call.x + first * n + i, n, count);
         auto get = [&](int i) { return load(learned + i * lanes); };
-        predict(call.functions, law_of(call, first, count), s, get, x, mean, variance);
+        predict(call.functions, law_of(call, first, count), s, get, x, mean, deviation);
         if (K == 1 && count == lanes) {
-            save(call.mean + first, mean[0]), save(call.deviation + first, root(variance[0]));
+            save(call.mean + first, mean[0]), save(call.deviation + first, deviation[0]);
             continue;
         }
         for (int o = 0; o < K; ++o)
             for (int l = 0; l < count; ++l) {
                 call.mean[(first + l) * K + o] = REAL(mean[o][l]);
-                call.deviation[(first + l) * K + o] = REAL(std::sqrt(variance[o][l]));
+                call.deviation[(first + l) * K + o] = REAL(deviation[o][l]);
             }
     }
 }
 
-// Streams that move: gathered from anywhere in the tile, so that no others pay. Then `squares` has their squared
-// errors in units of the variance predicted before: (tile / lanes, K).
-static void move(const Call &call, const int64_t *rows, int count, const V *h, const Mask afresh, V *squares) {
-    V mean[K][M], learned[M * (M + 1) / 2], expected[K];
+// Streams that move: gathered from anywhere in the tile, so that no others pay. Then `expected` has what was expected
+// of every output, of one that is always 1, and the unknown share: (tile / lanes, K + 2).
+static void move(const Call &call, const int64_t *rows, int count, const V *h, const Mask afresh, V *expected) {
+    V mean[K + 1][M], learned[M * (M + 1) / 2], found[K + 2];
     REAL *place[lanes];
     for (int l = 0; l < count; ++l) place[l] = block_of(call, rows[l] / lanes * lanes) + rows[l] % lanes;
     auto at = [&](int row, int l) -> REAL & { return place[l][row * lanes]; };
-    for (int o = 0; o < K; ++o)
+    for (int o = 0; o <= K; ++o)
         for (int i = 0; i < M; ++i) {
             mean[o][i] = V{};
             for (int l = 0; l < count; ++l) mean[o][i][l] = at(row_mean + o * M + i, l);
@@ -132,18 +131,15 @@ static void move(const Call &call, const int64_t *rows, int count, const V *h, c
         learned[i] = V{};
         for (int l = 0; l < count; ++l) learned[i][l] = at(row_learned + i, l);
     }
-    V variance = moments(call.functions, h, mean, [&](int i) { return learned[i]; }, expected);
+    found[K + 1] = moments(call.functions, h, mean, [&](int i) { return learned[i]; }, found);
     for (int l = 0; l < count; ++l) {
         const double once = call.forgetting[rows[l]], lapse = call.lapse ? call.lapse[rows[l]] : 1;
-        variance[l] = 1 + call.ratio[rows[l]] - (lapse == 1 ? once : std::pow(once, lapse)) * variance[l];
+        found[K + 1][l] = 1 - (lapse == 1 ? once : std::pow(once, lapse)) * found[K + 1][l];
     }
-    for (int o = 0; o < K; ++o) {
-        for (int l = 0; l < count; ++l) expected[o][l] -= double(call.y[rows[l] * K + o]);
-        const V square = expected[o] * expected[o] / variance;
-        for (int l = 0; l < count; ++l) squares[rows[l] % tile / lanes * K + o][rows[l] % lanes] = square[l];
-    }
+    for (int o = 0; o < expectations; ++o)
+        for (int l = 0; l < count; ++l) expected[rows[l] % tile / lanes * expectations + o][rows[l] % lanes] = found[o][l];
     transfer(call.functions, h, mean, learned);
-    for (int o = 0; o < K; ++o)
+    for (int o = 0; o <= K; ++o)
         for (int i = 0; i < M; ++i)
             for (int l = 0; l < count; ++l) at(row_mean + o * M + i, l) = afresh[l] ? REAL(0) : REAL(mean[o][i][l]);
     for (int i = 0; i < row_errors - row_learned; ++i)
@@ -156,7 +152,7 @@ static void learn(const Call &call) {
     for (int64_t begin = 0; begin < call.streams; begin += tile) {
         const int64_t end = begin + tile < call.streams ? begin + tile : call.streams;
         Verdict verdicts[tile / lanes];
-        V squares[tile / lanes * K];
+        V expected[tile / lanes * expectations];
         int64_t rows[lanes];
         V h[n]{};
         Mask afresh{};
@@ -173,21 +169,19 @@ static void learn(const Call &call) {
             v = judge(law_of(call, first, count), s, x, y, seen, count_of(call, 2, first, count));
             REAL *block = block_of(call, first);
             for (int i = 0; i < n; ++i) save(block + (n + i) * lanes, s.last[i]);
-            for (int o = 0; o < K; ++o) save(block + (row_errors + o) * lanes, s.errors[o]);
             if (!any(v.moves)) continue;
+            if (any(v.afresh))
+                for (V *part = s.errors; part <= &s.largest; ++part) save(block + (row_errors + (part - s.errors)) * lanes, *part);
             for (int l = 0; l < count; ++l)
                 if (v.moves[l]) {
                     rows[moving] = first + l;
                     for (int i = 0; i < n; ++i) h[i][moving] = v.z[i][l];
                     afresh[moving] = v.afresh[l];
-                    if (v.afresh[l]) {
-                        call.counts[3 * call.stride + first + l] = 0;
-                        block[(row_errors + K) * lanes + l] = 0;
-                    }
-                    if (++moving == lanes) move(call, rows, moving, h, afresh, squares), moving = 0;
+                    if (v.afresh[l]) call.counts[3 * call.stride + first + l] = 0;
+                    if (++moving == lanes) move(call, rows, moving, h, afresh, expected), moving = 0;
                 }
         }
-        if (moving) move(call, rows, moving, h, afresh, squares);
+        if (moving) move(call, rows, moving, h, afresh, expected);
         for (int64_t first = begin; first < end; first += lanes) {
             const int count = end - first < lanes ? int(end - first) : lanes;
             const Verdict &v = verdicts[(first - begin) / lanes];
@@ -208,12 +202,10 @@ static void learn(const Call &call) {
             const Mask good = update(
                 call.functions, law_of(call, first, count), s, [&](int i) { return load(learned + i * lanes); },
                 [&](int i, V value) { save(learned + i * lanes, value); }, z, y, seen, lapse, v.fine,
-                v.moves & ~v.afresh, squares + (first - begin) / lanes * K);
-            for (int o = 0; o < K; ++o) {
-                put(row_errors + o, s.errors[o]);
+                v.moves & ~v.afresh, expected + (first - begin) / lanes * expectations);
+            for (int o = 0; o <= K; ++o)
                 for (int i = 0; i < M; ++i) put(row_mean + o * M + i, s.mean[o][i]);
-            }
-            put(row_errors + K, s.largest);
+            for (V *part = s.errors; part <= &s.largest; ++part) put(row_errors + (part - s.errors), *part);
             int64_t *at = counts_of(call, 0, first), *skipped = counts_of(call, 1, first);
             save_count(at, saved_count(at, count) - good, count);
             save_count(skipped, saved_count(skipped, count) - ~good, count);

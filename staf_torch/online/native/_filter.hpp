@@ -28,7 +28,7 @@ typedef double V __attribute__((vector_size(64)));
 typedef int64_t Mask __attribute__((vector_size(64)));  // lanes of 0 or -1
 constexpr int lanes = 8, n = DIM, M = COUNT, K = OUTPUTS;
 constexpr double infinity = std::numeric_limits<double>::infinity();
-constexpr double surprise = 25, streak_limit = 8, error_rate = .05;
+constexpr double surprise = 25, streak_limit = 8, error_rate = .05, spread_rate = 1e-3, least_part = 1e-3, novel = 4;
 
 INLINE V all(double x) { return V{} + x; }
 INLINE V maximum(V a, V b) { return a > b ? a : b; }
@@ -41,6 +41,12 @@ INLINE V root(V a) {
     for (int l = 0; l < lanes; ++l) a[l] = std::sqrt(a[l]);
     return a;
 #endif
+}
+// sqrt(a^2 + b^2), whose squares may be no numbers.
+INLINE V hypotenuse(V a, V b) {
+    const V size = maximum(maximum(absolute(a), absolute(b)), all(1e-300));
+    a /= size, b /= size;
+    return size * root(a * a + b * b);
 }
 INLINE Mask finite(V a) { return a - a == V{}; }
 INLINE bool any(Mask m) {
@@ -73,12 +79,13 @@ struct Functions {  // of local_functions.py, in float64
 };
 
 struct Filter {  // of lanes streams
-    V anchor[n], last[n], mean[K][M], learned[M * (M + 1) / 2], errors[K], largest, since;  // D's lower triangle
+    V anchor[n], last[n], mean[K + 1][M], learned[M * (M + 1) / 2];  // D's lower triangle
+    V errors[K], surprises[K], told[K], level[K], spread[K], leaps[K], usual, largest, since;
 };
 
 struct Law {
     V ratio, forgetting, slack2, robust, base;  // base: variance of the process in the units of y, at first
-    double tiny, most, limit;  // the square root of the precision of the streams, their largest number, its 3/4th power
+    double tiny, most;  // the square root of the precision of the streams, their largest number
 };
 
 INLINE void functions_at(const Functions &f, const V *z, V *psi) {
@@ -115,7 +122,7 @@ template <bool lower, Triangular upper, typename A, typename B, typename Put> IN
 }
 
 // u <- T u and D <- T D T' for a step h, and nothing where the step is too far for the kernel.
-static void transfer(const Functions &f, const V *h, V mean[K][M], V *learned) {
+static void transfer(const Functions &f, const V *h, V mean[K + 1][M], V *learned) {
     V square{}, before[M], after[M], T[M][M], half[M][M], whole[M][M];
     for (int i = 0; i < n; ++i) square += (h[i] / f.reach) * (h[i] / f.reach);
     const Mask near = square <= 1e16;
@@ -135,7 +142,7 @@ static void transfer(const Functions &f, const V *h, V mean[K][M], V *learned) {
                    [&](int i, int l, V sum) { half[i][l] = sum * after[i]; });
     product<false, first>([&](int i, int k) { return f.newton[i * M + k]; }, [&](int i, int l) { return half[i][l]; },
                    [&](int k, int l, V sum) { T[l][k] = near ? sum : V{}; });  // the transpose, to be read along rows
-    for (int o = 0; o < K; ++o) {
+    for (int o = 0; o <= K; ++o) {
         V moved[M]{};
         for (int l = 0; l < M; ++l)
             for (int k = 0; k < M; ++k) moved[k] += T[l][k] * mean[o][l];
@@ -149,11 +156,6 @@ static void transfer(const Functions &f, const V *h, V mean[K][M], V *learned) {
                   [&](int k, int l, V sum) { learned[k * (k + 1) / 2 + l] = sum; });
 }
 
-INLINE V running_scale(const Law &law, V errors, V since) {
-    const V trust = minimum(since, all(20)) / 20.;
-    return maximum(errors * trust + law.base * (1. - trust), 1e-6 * law.base);
-}
-
 INLINE Mask is_fresh(const Filter &s) {
     V sum{};
     for (int i = 0; i < n; ++i) sum += s.anchor[i];
@@ -163,7 +165,7 @@ INLINE Mask is_fresh(const Filter &s) {
 // V's mean; psi'D psi, by which samples have made its variance less than 1, is returned. D's lower triangle is asked
 // for by numbers.
 template <typename Get>
-INLINE V moments(const Functions &f, const V *z, const V known[K][M], Get learned, V mean[K]) {
+INLINE V moments(const Functions &f, const V *z, const V known[K + 1][M], Get learned, V mean[K + 1]) {
     V psi[M], total{};
     functions_at(f, z, psi);
     for (int i = 0, at = 0; i < M; ++i) {
@@ -171,24 +173,52 @@ INLINE V moments(const Functions &f, const V *z, const V known[K][M], Get learne
         for (int j = 0; j < i; ++j) sum += learned(at++) * psi[j];
         total += psi[i] * (sum + sum + learned(at++) * psi[i]);
     }
-    for (int o = 0; o < K; ++o) {
+    for (int o = 0; o <= K; ++o) {
         mean[o] = V{};
         for (int i = 0; i < M; ++i) mean[o] += psi[i] * known[o][i];
     }
     return total;
 }
 
-// Mean and variance of the next y at x, a unit of time after the latest.
+// The deviation of y, that of the prior where it has been constant; and the amplitude that the errors say.
+INLINE V spread_of(const Law &law, const Filter &s, int o) {
+    return s.spread[o] > 1e-15 * absolute(s.level[o]) ? s.spread[o] : root(law.base);
+}
+INLINE V amplitude_of(const Law &law, const Filter &s, int o) {
+    const V trust = minimum(maximum(s.told[o] - 2., V{}), all(20)) / 20.;
+    return maximum(hypotenuse(s.errors[o] * root(trust), root(law.base * (1. - trust))), least_part * spread_of(law, s, o));
+}
+
+struct Outlook {  // on the next y
+    V mean[K], deviation[K], weight[K];  // weight: of its square, what the amplitude makes
+};
+// From psi'u of every output and of one that is always 1, and the share of V's variance that is unknown.
+INLINE Outlook outlook(const Law &law, const Filter &s, const V *expected, V unknown) {
+    Outlook found;
+    const V most = minimum(novel * s.usual, 1. - (1. - s.usual) / 4.), one = expected[K];
+    const V away = minimum(maximum((unknown - most) / maximum(1. - most, all(1e-9)), V{}), all(1));
+    const V part = root(minimum(unknown, most) + law.ratio);
+    for (int o = 0; o < K; ++o) {
+        const V near = amplitude_of(law, s, o) * part, far = maximum(spread_of(law, s, o), near);
+        const V square = (near / far) * (near / far), whole = away + (1. - away) * square;
+        found.mean[o] = expected[o] + s.level[o] * (1. - one);
+        found.deviation[o] = far * root(whole), found.weight[o] = square < 1. ? (1. - away) * square / whole : all(1);
+    }
+    return found;
+}
+
+// Mean and deviation of the next y at x, a unit of time after the latest.
 template <typename Get>
 INLINE void predict(const Functions &f, const Law &law, const Filter &s, Get learned, const V *x, V mean[K],
-                    V variance[K]) {
-    V z[n];
+                    V deviation[K]) {
+    V z[n], expected[K + 1];
     for (int i = 0; i < n; ++i) z[i] = (x[i] != x[i] ? s.last[i] : x[i]) - s.anchor[i];
-    const V spread = 1. + law.ratio - law.forgetting * moments(f, z, s.mean, learned, mean);
+    const V unknown = 1. - law.forgetting * moments(f, z, s.mean, learned, expected);
+    const Outlook found = outlook(law, s, expected, minimum(maximum(unknown, V{}), all(1)));
     const Mask fresh = is_fresh(s);
     for (int o = 0; o < K; ++o) {
-        mean[o] = fresh ? V{} : mean[o];
-        variance[o] = fresh ? law.base * (1. + law.ratio) : spread * running_scale(law, s.errors[o], s.since);
+        mean[o] = fresh ? V{} : found.mean[o];
+        deviation[o] = fresh ? root(law.base * (1. + law.ratio)) : found.deviation[o];
     }
 }
 
@@ -223,16 +253,44 @@ INLINE Verdict judge(const Law &law, Filter &s, V *x, V *y, Mask *seen, V streak
     }
     v.moves = v.fine & (v.afresh | (sum > law.slack2));
     for (int i = 0; i < n; ++i) s.last[i] = finite(x[i]) ? x[i] : s.last[i];
-    for (int o = 0; o < K; ++o) s.errors[o] = v.afresh ? V{} : s.errors[o];
+    if (any(v.afresh))
+        for (V *part = s.errors; part <= &s.since; ++part) *part = v.afresh ? V{} : *part;
     return v;
 }
 
+// A value, at most so many times its running size, each in a row so many more; and how many are in a row.
+INLINE V limited(V value, V running, V told, V &row) {
+    const double step = std::sqrt(surprise);
+    const Mask large = (told >= streak_limit + 2.) & (value > step * running);
+    if (any(large)) value = large ? minimum(value, exponential((1. + row) * std::log(step)) * running) : value;
+    row = large ? minimum(row + 1., all(100)) : V{};
+    return value;
+}
+// The running errors of an output after one of so many deviations, and the running mean and deviation of y.
+INLINE void learn_scales(const Law &law, Filter &s, int o, V y, V away, V weight, Mask good) {
+    const V inside = maximum(1. + weight * (away * away - 1.), V{}), told = s.told[o], spread = spread_of(law, s, o);
+    const V counted = minimum(amplitude_of(law, s, o) * root(inside), all(1e300));
+    V surprises = s.surprises[o], leaps = s.leaps[o];
+    const V size = limited(counted, maximum(s.errors[o], least_part * spread), told, surprises);
+    const V rate = maximum(1. / maximum(told - 1., all(1)), all(error_rate));
+    const V errors = minimum(hypotenuse(root(1. - rate) * s.errors[o], root(rate) * size), all(law.most));
+    s.errors[o] = good ? (told >= 2. ? errors : V{}) : s.errors[o];
+    s.surprises[o] = good ? surprises : s.surprises[o];
+    const V slow = maximum(minimum(3. / (told + 3.), 1. / maximum(told - 40., all(1))), all(spread_rate));
+    const V apart = limited(absolute(y - s.level[o]), spread, told, leaps), step = y < s.level[o] ? -apart : apart;
+    const V deviation = minimum(root(1. - slow) * hypotenuse(s.spread[o], root(slow) * step), all(law.most));
+    const V level = minimum(maximum(s.level[o] + slow * step, all(-law.most)), all(law.most));
+    s.told[o] = good & ((deviation > 0.) | (told == 0.)) ? minimum(told + 1., all(2 / spread_rate)) : told;
+    s.level[o] = good ? level : s.level[o], s.spread[o] = good ? deviation : s.spread[o];
+    s.leaps[o] = good ? leaps : s.leaps[o];
+}
+
 // The Kalman update at z from the anchor, where the result is finite: these lanes are returned. Where the centers
-// have moved, `before` has the squared errors in units of the variance that was predicted before they did.
+// have moved, `before` has what was expected before they did, and the unknown share behind it.
 template <typename Get, typename Put>
 INLINE Mask update(const Functions &f, const Law &law, Filter &s, Get learned, Put put, const V *z, const V *y,
                    const Mask *seen, V lapse, Mask fine, Mask moved, const V *before) {
-    V psi[M], known[M]{}, gain[M], change[K], spread = 1. + law.ratio, share, total{}, peak{};
+    V psi[M], known[M]{}, gain[M], left[K + 1], expected[K + 1], kept[K], away[K], spread = 1. + law.ratio, share, total{}, peak{};
     functions_at(f, z, psi);
     share = lapse == 1. ? law.forgetting : V{};
     if (any(lapse != 1.))
@@ -251,32 +309,43 @@ INLINE Mask update(const Functions &f, const Law &law, Filter &s, Get learned, P
         gain[i] = psi[i] - known[i];
         total += gain[i] * 0.;  // not a number where one of them is not finite
     }
-    const V rate = maximum(1. / (s.since + 1.), all(error_rate)), inverse = 1. / spread;
-    V size = s.largest, errors[K];
+    V inverse = 1. / spread, unknown = moved ? before[K + 1] : spread - law.ratio;
+    unknown = minimum(maximum(unknown, V{}), all(1));
+    for (int o = 0; o <= K; ++o) {
+        V sum{};
+        for (int i = 0; i < M; ++i) sum += psi[i] * s.mean[o][i];
+        left[o] = (o < K ? y[o] : all(1)) - sum;
+        expected[o] = moved ? before[o] : sum;
+    }
+    const Outlook view = outlook(law, s, expected, unknown);
+    V size = s.largest;
+    V next[K + 1][M];
+    for (int i = 0; i < M; ++i) {
+        next[K][i] = s.mean[K][i] + gain[i] * left[K] * inverse;
+        total += next[K][i] * 0., peak = maximum(peak, absolute(next[K][i]));
+    }
     for (int o = 0; o < K; ++o) {
-        V error = y[o];
-        for (int i = 0; i < M; ++i) error -= psi[i] * s.mean[o][i];
-        const V square = minimum(moved & finite(before[o]) ? before[o] : error * error * inverse, all(law.most));
-        const V limited = minimum(square, all(law.limit));
-        V kept = all(1);
-        if (any(law.robust < infinity))  // a fifth of the time of a small filter
-            kept = minimum(law.robust * root(running_scale(law, s.errors[o], s.since) / square), all(1));
-        change[o] = seen[o] ? kept * error * inverse : V{};
-        const V counted = s.since < streak_limit ? limited : minimum(limited, surprise * s.errors[o]);
-        errors[o] = seen[o] ? s.errors[o] + rate * (counted - s.errors[o]) : s.errors[o];
+        const V of_level = s.level[o] * left[K];
+        // nothing was expected of the first value, nor where a number overflows
+        const Mask expects = (s.told[o] > 0.) & finite(view.mean[o]) & finite(view.deviation[o]);
+        away[o] = expects ? minimum(absolute(y[o] - view.mean[o]) / view.deviation[o], all(1e150)) : V{};
+        kept[o] = away[o] > law.robust ? law.robust / away[o] : all(1);
+        const V change = seen[o] ? (kept[o] < 1. ? kept[o] * (left[o] - of_level) + of_level : left[o]) * inverse : V{};
+        const Mask first = seen[o] & (s.told[o] == 0.);  // as if it had always been so
         size = maximum(size, absolute(y[o]));
         for (int i = 0; i < M; ++i) {
-            const V next = s.mean[o][i] + gain[i] * change[o];
-            total += next * 0., peak = maximum(peak, absolute(next));
+            next[o][i] = first ? y[o] * next[K][i] : s.mean[o][i] + gain[i] * change;
+            total += next[o][i] * 0., peak = maximum(peak, absolute(next[o][i]));
         }
     }
     const Mask good = fine & (spread > 0.) & (total == 0.) & finite(spread) & (peak <= law.most);
     s.largest = good ? size : s.largest;
+    for (int o = 0; o < K; ++o) learn_scales(law, s, o, y[o], away[o], view.weight[o], good & seen[o]);
+    const V followed = maximum(1. / maximum(s.since, all(1)), all(error_rate));
+    s.usual = good ? (s.since > 0. ? s.usual + followed * (unknown - s.usual) : V{}) : s.usual;
     s.since = good ? s.since + 1. : s.since;
-    for (int o = 0; o < K; ++o) {
-        s.errors[o] = good ? errors[o] : s.errors[o];
-        for (int i = 0; i < M; ++i) s.mean[o][i] = good ? s.mean[o][i] + gain[i] * change[o] : s.mean[o][i];
-    }
+    for (int o = 0; o <= K; ++o)
+        for (int i = 0; i < M; ++i) s.mean[o][i] = good ? next[o][i] : s.mean[o][i];
     for (int i = 0, at = 0; i < M; ++i) {
         const V part = gain[i] * inverse;
         for (int j = 0; j <= i; ++j, ++at) {
