@@ -27,9 +27,9 @@ class StreamState:
     u is the mean of the weights, I - D their covariance: D, 0 <= D <= I, is what has been learned. The rows
     of the table: the anchor, x as last measured, u output by output and of an output that is always 1, D's
     lower triangle row by row; for every output the root mean square of its standardised errors, how many in
-    a row were a surprise, how many were counted, mean and spread of y, its leaps in a row; then the running share of V that was
-    unknown, and the largest |y| learned. In memory the numbers of `LANES` streams stand together, so that
-    machine code reads them one after the other.
+    a row were a surprise, how many were counted, mean and spread of y, its leaps in a row; then the running
+    share of V that was unknown, and the largest |y| learned. In memory the numbers of `LANES` streams stand
+    together, so that machine code reads them one after the other.
     """
 
     blocks: Tensor  # (ceil(S / LANES), 2 n + (K + 1) M + M (M + 1) / 2 + 6 K + 2, LANES)
@@ -156,14 +156,14 @@ class LocalFilter:
 
     A sample: P <- I - lambda D (what was learned fades towards the prior), then the Kalman update; a
     prediction is of a sample one unit of time after the latest, with lambda D. When the state has left the
-    anchor the centers move there, u <- T u and D <- T D T', |T| <= 1: D can only shrink, so that no covariance
-    winds up in directions that the stream does not visit. K outputs share D.
+    anchor the centers move there, u <- T u and D <- T D T', |T| <= 1: D can only shrink, so that no
+    covariance winds up in directions that the stream does not visit. K outputs share D.
 
-    m is the running mean of y. As the filter is linear, a second mean u1, of an output that is always 1, makes
-    it exact whatever m becomes: the prediction is psi'u + m (1 - psi'u1).
+    m is the running mean of y. As the filter is linear, a second mean u1, of an output that is always 1,
+    makes it exact whatever m becomes: the prediction is psi'u + m (1 - psi'u1).
 
-    The noise and the prior have scales of their own. On the stream the variance r + rho of a prediction, r the
-    share of V's that is unknown, is multiplied by c^2, the running mean of the squared errors in these units.
+    The noise and the prior have scales of their own. On the stream the variance r + rho of a prediction, r
+    the share of V's that is unknown, is multiplied by c^2, the running mean of the squared errors in these units.
     Away from it, where r is beyond some times its running mean, the variance goes over to that of y as r goes
     to 1. Of an error there, c learns by the share of the variance that it makes (the expectation step of
     Dempster, Laird and Rubin, 1977). Until y takes a second value nothing is known of its size, and
@@ -296,8 +296,9 @@ class LocalFilter:
         mean[:-1] = torch.where(first.unsqueeze(1), y.unsqueeze(1) * mean[-1], mean[:-1])
         learned = old.learned * share + gain.unsqueeze(1) * (gain / spread)
         errors, surprises = self._errors(old, away, before.weight.nan_to_num(0.0))
-        level, deviation, leaps = self._running_spread(old, y)
-        told = torch.where((deviation > 0) | first, (old.told + 1).clamp(max=2 / SPREAD_RATE), old.told)
+        level, deviation, leaps, told = spread_with(
+            y, old.level, old.spread, self._spread(old), old.leaps, old.told
+        )
         own = [
             torch.where(seen, new.clamp(-most, most), old_)
             for new, old_ in zip((errors, surprises, told, level, deviation, leaps), old[4:10], strict=True)
@@ -318,14 +319,6 @@ class LocalFilter:
         errors = torch.hypot((1 - rate).sqrt() * old.errors, rate.sqrt() * limited)
         return torch.where(old.told >= 2, errors, 0.0), surprises
 
-    def _running_spread(self, old: StateParts, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The running mean and deviation with another y. The first values may be outliers, and fade sooner."""
-        rate = torch.minimum(3 / (old.told + 3), 1 / (old.told - 40).clamp(min=1.0)).clamp(min=SPREAD_RATE)
-        size, leaps = _limited((y - old.level).abs(), self._spread(old), old.leaps, old.told)
-        step = torch.where(y < old.level, -size, size)
-        deviation = (1 - rate).sqrt() * torch.hypot(old.spread, rate.sqrt() * step)
-        return old.level + rate * step, deviation, leaps
-
     def _amplitude(self, old: StateParts) -> Tensor:
         """c: the prior's amplitude at first, then what errors say."""
         trust = (old.told - 2).clamp(0.0, 20.0) / 20.0
@@ -337,8 +330,34 @@ class LocalFilter:
         return torch.where(old.spread > 1e-15 * old.level.abs(), old.spread, self.base**0.5)
 
 
+def spread_with(
+    y: Tensor, level: Tensor, spread: Tensor, size: Tensor, leaps: Tensor, told: Tensor
+) -> tuple[Tensor, ...]:
+    """The running mean and deviation of y with another value.
+
+    The first values may be outliers, and fade sooner. As long as y is constant it counts as one value.
+
+    Args:
+        y: the value.
+        level: mean so far.
+        spread: deviation so far, 0 at first.
+        size: that deviation, or another one where y has been constant.
+        leaps: values in a row that were far away.
+        told: values so far.
+
+    Returns:
+        The next level, spread, leaps and told.
+    """
+    rate = torch.minimum(3 / (told + 3), 1 / (told - 40).clamp(min=1.0)).clamp(min=SPREAD_RATE)
+    step, leaps = _limited((y - level).abs(), size, leaps, told)
+    wide = (1 - rate).sqrt() * torch.hypot(spread, rate.sqrt() * step)
+    counts = (wide > 0) | (told == 0)
+    told = torch.where(counts, (told + 1).clamp(max=2 / SPREAD_RATE), told)
+    return level + rate * torch.where(y < level, -step, step), wide, leaps, told
+
+
 def _limited(value: Tensor, running: Tensor, row: Tensor, told: Tensor) -> tuple[Tensor, Tensor]:
-    """A value, at most so many times its running size, each in a row so many more; and how many are in a row."""
+    """A value, at most so many times its running size, each in a row so many more; how many are in a row."""
     step = math.sqrt(SURPRISE)
     large = (told >= STREAK + 2) & (value > step * running)
     most = step ** (1 + row) * running

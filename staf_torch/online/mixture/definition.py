@@ -11,13 +11,14 @@ import torch
 from torch import Tensor
 
 from ..filter_streams import units_of
-from ..kalman_filter import STREAK, LocalFilter, StreamState
+from ..kalman_filter import ERROR_RATE, STREAK, LocalFilter, StreamState, spread_with
 from ..local_functions import LocalFunctions
 from .members import QuadraticModels, Stretch, TrackerModels, learn_hyperparameters, quadratic_features
-from .mixing import judge, mix
+from .mixing import constant, judge, mix
 from .rules import FADING, GROUPS, PLAIN, SEARCHED, TRACKERS, TURNED, TURNED_FADING, BankShape, Rules, parts
 
 _RESET = ("skipped", "learned")  # what a stream that begins anew keeps
+JUDGED = 2  # the local process by whose unknown share x is away from the samples
 
 
 Views = dict[str, Tensor]
@@ -131,7 +132,8 @@ class BankDefinition:
         means = torch.maximum(torch.minimum(means, (high + wide)[:, None]), (low - wide)[:, None])
         s["means"].copy_(means)
         s["variances"].copy_(torch.where(variances < 1e300, variances, 1e300))
-        mix(r, s, low - wide, high + wide)
+        level, spread = (s["level"] - center[n:]) / spread[n:], s["wide"] / spread[n:]
+        mix(r, s, low - wide, high + wide, level, spread)
         s["asked"].copy_(x)
         s["answered"].fill_(1.0)
 
@@ -160,7 +162,9 @@ class BankDefinition:
         kernels += [sides[1][w] for w in (0, 0, 1, 1, 2, 2)]
         noise = torch.tensor(r.noise, dtype=torch.float64)
         rest = torch.stack([rests[select] for select in (0, 0, 0, 1) for _ in range(6)])  # (24, K, k)
-        return _processes(torch.stack(kernels), noise, rest, line)
+        means, variances, unknown = _processes(torch.stack(kernels), noise, rest, line)
+        s["unknown"].copy_(unknown[JUDGED])
+        return means, variances
 
     def _carry(self, s: Views, x: Tensor, y: Tensor, lapse: float) -> None:
         """The linear model, the quadratics, the trackers and the filters learn (x, y)."""
@@ -255,6 +259,7 @@ class BankDefinition:
     def learn(self, s: Views, given: Tensor, told: Tensor, lapse: float) -> None:
         """Learn one sample: (n,), (K,)."""
         x = torch.where(torch.isnan(given), s["last_x"], given)
+        repeats = torch.equal(x, s["last_x"])
         s["last_x"].copy_(torch.where(given.abs() < 1e150, given, s["last_x"]))
         for name in ("time", "unlearned"):
             s[name].add_(lapse)
@@ -286,7 +291,11 @@ class BankDefinition:
             if since is None:
                 return
             lapse = since
-            judge(self.rules, s, (y - center) / spread, judged, float(s["clock"]))
+            usual, clock = s["usual_unknown"], float(s["clock"])
+            usual.add_(max(ERROR_RATE, 1 / max(clock - 1, 1.0)) * (s["unknown"] - usual))
+            # a sample that repeats the last one says nothing of errors
+            says = judged & ~(repeats & torch.eq(y, s["last_y"]) & ~constant(s))
+            judge(self.rules, s, (y - center) / spread, says, clock)
         if float(s["far"]) > 0:
             s["skipped"].add_(1)
             return
@@ -334,6 +343,14 @@ class BankDefinition:
         torch.minimum(s["low"], torch.where(known, y, torch.inf), out=s["low"])
         torch.maximum(s["high"], torch.where(known, y, -torch.inf), out=s["high"])
         s["last_y"].copy_(torch.where(known, y, s["last_y"]))
+        self._learn_spread(s, y, known)
+
+    def _learn_spread(self, s: Views, y: Tensor, known: Tensor) -> None:
+        """The running mean and spread of y, as the filter's."""
+        spread = torch.where(constant(s), 1.0, s["wide"])
+        level, wide, leaps, told = spread_with(y, s["level"], s["wide"], spread, s["leaps"], s["told"])
+        for name, new in (("level", level), ("wide", wide), ("leaps", leaps), ("told", told)):
+            s[name].copy_(torch.where(known, new, s[name]))
 
     def _accept(self, s: Views, x: Tensor, y: Tensor, time: float, lapse: float, anew: bool = False) -> None:
         s["clock"].add_(1)
@@ -358,7 +375,7 @@ def _trackers(s: Views) -> TrackerModels:
     return TrackerModels(*(s[name] for name in parts))
 
 
-def _processes(kernels: Tensor, noise: Tensor, rest: Tensor, line: Tensor) -> tuple[Tensor, Tensor]:
+def _processes(kernels: Tensor, noise: Tensor, rest: Tensor, line: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Gaussian processes at the last of k + 1 points from the others, by elimination.
 
     Args:
@@ -381,4 +398,4 @@ def _processes(kernels: Tensor, noise: Tensor, rest: Tensor, line: Tensor) -> tu
         a[:, k + 1 :, k + 1 :] -= column[:, :, None] * column[:, None]
     amplitude = amplitude / count
     variance = torch.maximum(amplitude * (1 + noise - seen)[:, None], amplitude * noise[:, None])
-    return (line + mean).mT, variance.mT
+    return (line + mean).mT, variance.mT, (1 - seen).clamp(min=0.0)

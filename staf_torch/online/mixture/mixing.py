@@ -5,14 +5,31 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..kalman_filter import SURPRISE
+from ..kalman_filter import NOVEL, SURPRISE
 from .rules import BLENDS, CARRIED, GROUPS, KNOTS, LOCAL, MEMBERS, QUADRATIC, Rules, group
 
 _LEAST = 1e-30  # of a variance
+_STILL = 1e-4  # variance, in units, of what has been constant so far
 _GROUP = torch.tensor([group(member) for member in range(MEMBERS)], dtype=torch.int64)
 
 
-def mix(r: Rules, s: dict[str, Tensor], low: Tensor, high: Tensor) -> None:
+def constant(s: dict[str, Tensor]) -> Tensor:
+    """Outputs that have been constant so far, (K,)."""
+    return ~(s["wide"] > 1e-15 * s["level"].abs())
+
+
+def _let_go(s: dict[str, Tensor], level: Tensor, wide: Tensor) -> None:
+    """Away from the samples the band goes over to the spread of y around its mean, (K,), in units."""
+    usual, still = s["usual_unknown"], constant(s)
+    most = torch.minimum(NOVEL * usual, 1 - (1 - usual) / 4)
+    away = ((s["unknown"] - most) / (1 - most).clamp(min=1e-9)).clamp(0.0, 1.0)
+    far = torch.where(still, 1.0, wide.square()) + (s["mean"] - level).square()
+    near = torch.where(still, s["variance"].clamp(min=_STILL), s["variance"])
+    s["variance"].copy_(near + away * (far - near).clamp(min=0.0))
+    s["weight"].copy_(torch.where(near < far, (1 - away) * near / s["variance"], 1.0))
+
+
+def mix(r: Rules, s: dict[str, Tensor], low: Tensor, high: Tensor, level: Tensor, wide: Tensor) -> None:
     """The mixture of what the members say, and its variance: a mixture of four.
 
     A member that is less certain than it usually is has less weight, as far as another one is more certain
@@ -29,6 +46,8 @@ def mix(r: Rules, s: dict[str, Tensor], low: Tensor, high: Tensor) -> None:
         s: parts of a stream; ``means`` and ``variances`` are what the members say.
         low: of the range in which a prediction must be, (K,).
         high: (K,).
+        level: mean of y, (K,).
+        wide: its spread, (K,).
     """
     means = s["means"]
     claims = s["variances"].clamp(min=_LEAST).log()
@@ -62,6 +81,7 @@ def mix(r: Rules, s: dict[str, Tensor], low: Tensor, high: Tensor) -> None:
     s["mean"].copy_(_weighed(r, s["corrected"], s["blend"]))
     variance = variance + (s["mean"] - blend).square()
     s["variance"].copy_(torch.maximum(variance, r.floor * s["pace"]) * s["calibration"])
+    _let_go(s, level, wide)
 
 
 def _weighed(r: Rules, logs: Tensor, values: Tensor) -> Tensor:
@@ -107,9 +127,11 @@ def judge(r: Rules, s: dict[str, Tensor], value: Tensor, told: Tensor, t: float)
     _learn_correction(r, s, blended, told)
     _learn_map(r, s, value, told)
     old, since = s["calibration"], t - r.uncalibrated
-    z2 = error.square() / (s["variance"] / old).clamp(min=1e-300)
+    z2 = error.square() / s["variance"].clamp(min=1e-300)
+    row = SURPRISE ** s["surprises"]  # each in a row may be so many times larger
     rate = max(r.error_rate, 1 / (since + 5)) if since > 0 else 0.0
-    put("calibration", (old + rate * (torch.minimum(z2, SURPRISE * old) - old)).clamp(1e-6, 1e2))
+    surprised = torch.minimum((s["weight"] * (z2 - 1)).clamp(min=-1.0), SURPRISE * row - 1)
+    put("calibration", (old + rate * surprised * old).clamp(1e-6, 1e2))
     of_blends = (value[:, None] - s["blend"]).square()
     scores = _student(r, of_blends.sqrt(), s["own"].clamp(min=_LEAST)[:, None])
     corrected = _reweighed(r.correction_share, r.correction_discount * s["corrected"] + scores)
@@ -122,20 +144,23 @@ def judge(r: Rules, s: dict[str, Tensor], value: Tensor, told: Tensor, t: float)
         ("best", of_blends.amin(-1), r.best_rate, r.largest),
     ):
         old = s[name]
-        put(name, old + max(rate, 1 / (t + 1)) * (torch.minimum(found, most * old) - old))
+        step = max(rate, 1 / (t + 1)) * (torch.minimum(found, most * row * old) - old)
+        put(name, (old + step).clamp(min=_LEAST))
     away, v = value[:, None] - s["means"], s["variances"]
     score = _scores(r, away, v * s["excess"], s["error"][:, None])
     over = _scores(r, value[:, None] - s["mixed"], s["mixed_variance"], s["error"][:, None])
     old, rate = s["excess"], max(r.members_rate, 1 / (t + 3))
     ratio, logs = away.square() / v.clamp(min=_LEAST), v.clamp(min=_LEAST).log()
-    put("excess", (old + rate * (torch.minimum(ratio, SURPRISE * old) - old)).clamp(r.least, 1e8))
+    most = SURPRISE * row[:, None]
+    put("excess", (old + rate * (torch.minimum(ratio, most * old) - old)).clamp(r.least, 1e8))
     put("usual", s["usual"] + max(r.members_rate, 1 / (t + 1)) * (logs - s["usual"]))
     of = slice(LOCAL + CARRIED, LOCAL + CARRIED + QUADRATIC)
-    factor = 1 + max(r.pace, 1 / (t + 2)) * (ratio[:, of].clamp(max=SURPRISE) - 1)
+    factor = 1 + max(r.pace, 1 / (t + 2)) * (torch.minimum(ratio[:, of], most) - 1)
     put("quadratic_error", (s["quadratic_error"] * factor).clamp(min=1e-26))
     discounts = torch.tensor(r.discounts, dtype=torch.float64)[:, None]
     put("weights", _reweighed(r.share, discounts * s["weights"] + score[:, None]))
     put("clock_weights", _reweighed(r.share, r.discount * s["clock_weights"] + over))
+    put("surprises", torch.where(z2 > SURPRISE, (s["surprises"] + 1).clamp(max=40.0), 0.0))
     put("corrected", corrected)
     put("squares", squares)
 

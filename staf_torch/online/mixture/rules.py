@@ -146,6 +146,11 @@ def layout(shape: BankShape) -> list[tuple[str, tuple[int, ...]]]:
         *(("excess", (k, MEMBERS)), ("usual", (k, MEMBERS))),  # running scales; logarithms of variances
         ("squares", (k, MEMBERS)),  # logarithms of the weights by squared errors
         *((name, (k,)) for name in ("error", "pace", "own", "best", "low", "high", "calibration")),
+        *(
+            (name, (k,)) for name in ("level", "wide", "leaps", "told")
+        ),  # mean and spread of y: see `spread_with`
+        *(("weight", (k,)), ("surprises", (k,))),  # of the variance, what the errors say; surprises in a row
+        *(("unknown", ()), ("usual_unknown", ())),  # share of the variance of a local process, and its mean
         *(("correction_covariance", (k, GROUPS, GROUPS)), ("correction", (k, GROUPS))),  # coefficients
         ("away", (k, GROUPS)),  # of the groups from the mixture, in running errors
         ("corrected", (k, BLENDS)),  # logarithms of the weights of the four mixtures

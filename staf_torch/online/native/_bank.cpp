@@ -291,12 +291,26 @@ static void keep(const Rules &r, Stream &s, const double *x, const double *y, do
                 }
 }
 
+// The running mean and spread of y, as the filter's: what learn_scales of _filter.hpp does of it.
+static void learn_spread(Stream &s, int o, double y) {
+    const double told = s.told[o], spread = constant(s, o) ? 1 : s.wide[o], step = std::sqrt(surprise);
+    double size = std::fabs(y - s.level[o]);
+    const bool large = told >= streak_limit + 2 && size > step * spread;
+    if (large) size = std::min(size, std::pow(step, 1 + s.leaps[o]) * spread);
+    s.leaps[o] = large ? std::min(s.leaps[o] + 1, 100.) : 0;
+    const double rate = std::max(std::min(3 / (told + 3), 1 / std::max(told - 40, 1.)), spread_rate);
+    s.wide[o] = std::sqrt(1 - rate) * std::hypot(s.wide[o], std::sqrt(rate) * size);
+    s.level[o] += y < s.level[o] ? -rate * size : rate * size;
+    if (s.wide[o] > 0 || told == 0) s.told[o] = std::min(told + 1, 2 / spread_rate);
+}
+
 // The range of y, of outputs that are measured now or have been before.
 static void notice(Stream &s, const double *y, const bool *measured) {
     for (int o = 0; o < K; ++o) {
         if (!(measured && measured[o]) && s.low[o] == infinity) continue;
         s.low[o] = std::min(s.low[o], y[o]), s.high[o] = std::max(s.high[o], y[o]);
         s.last_y[o] = y[o];
+        learn_spread(s, o, y[o]);
     }
 }
 
@@ -343,6 +357,7 @@ static void learn(const Rules &r, Stream &s, const double *given, const double *
     bool some = false, measured = false, sound = true;
     for (int i = 0; i < n; ++i) x[i] = given[i] == given[i] ? given[i] : s.last_x[i], sound &= std::isfinite(x[i]);
     for (int i = 0; i < n; ++i) measured |= given[i] == given[i];
+    bool repeats = std::equal(x, x + n, s.last_x);
     for (int o = 0; o < K; ++o) some |= told[o] == told[o], sound &= !std::isinf(told[o]);
     for (int i = 0; i < n; ++i)
         if (std::isfinite(given[i]) && std::fabs(given[i]) < 1e150) s.last_x[i] = given[i];
@@ -372,8 +387,10 @@ static void learn(const Rules &r, Stream &s, const double *given, const double *
     else if (known) {
         lapse = s.unlearned, s.unlearned = 0;
         if (waits(r, s, x, y, judged, lapse)) return;
-        for (int o = 0; o < K; ++o)
-            if (judged[o] == judged[o]) judge_members(r, s, o, in_units(r, s, o, y[o]));
+        s.usual_unknown += std::max(error_rate, 1 / std::max(s.clock - 1, 1.)) * (s.unknown - s.usual_unknown);
+        for (int o = 0; o < K; ++o)  // a sample that repeats the last one says nothing of errors
+            if (judged[o] == judged[o] && !(repeats && y[o] == s.last_y[o] && !constant(s, o)))
+                judge_members(r, s, o, in_units(r, s, o, y[o]));
     }
     if (s.far > 0) return;
     s.unlearned = 0;

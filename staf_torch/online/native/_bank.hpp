@@ -8,6 +8,8 @@ constexpr int near = NEIGHBOURS, sides = 2, groups = 3, locals = groups * lanes,
 constexpr int members = locals + carried + 2 * lanes + 2, clocks = 3;  // quadratics, trackers, the linear model, the last value
 constexpr int unknowns = n + 1, groups_of_members = 11, blends = 4, knots = 33;
 constexpr double least = 1e-30;  // of a variance
+constexpr int judged_member = 2;  // by whose unknown share x is away from the samples
+constexpr double still = 1e-4;    // variance, in units, of what has been constant so far
 
 struct Rules {  // in the order of mixture/rules.py, which says what they are
     double width_rates[3], tracker_rate[lanes], scaling, carried_slack, fade_rates[2], noise[locals];
@@ -36,6 +38,9 @@ struct Stream {  // the row of a stream in the table of mixture/rules.py
     double weights[K][clocks][members], clock_weights[K][clocks], excess[K][members], usual[K][members];
     double squares[K][members];
     double error[K], pace[K], own[K], best[K], low[K], high[K], calibration[K];
+    double level[K], wide[K], leaps[K], told[K];  // mean and spread of y
+    double weight[K], surprises[K];  // of the variance, what the errors say; surprises in a row
+    double unknown, usual_unknown;   // share of the variance of a local process, and its running mean
     double correction_covariance[K][groups_of_members][groups_of_members], correction[K][groups_of_members];
     double away[K][groups_of_members], corrected[K][blends];
     double map[K][2][knots];  // corrections, and what is known of them
@@ -149,6 +154,7 @@ static void local_processes(const Rules &r, Stream &s, const double *x, const do
                 amplitude[o] += beta[o][k] * beta[o][k];
             }
             seen += a[count][k] * a[count][k];
+            if (g == 0) s.unknown = std::max(1 - seen[judged_member], 0.);
             for (int j = k + 1; j < count; ++j) {
                 const V factor = a[j][k];
                 for (int i = j; i <= count; ++i) a[i][j] -= a[i][k] * factor;
@@ -184,6 +190,20 @@ static int knot_of(const Rules &r, double mean, double &part) {
     const int knot = std::min(int(place), knots - 2);
     part = place - knot;
     return knot;
+}
+
+// y has been constant so far.
+static bool constant(const Stream &s, int o) { return !(s.wide[o] > 1e-15 * std::fabs(s.level[o])); }
+
+// Away from the samples the band goes over to the spread of y around its mean.
+static void let_go(const Rules &r, Stream &s, int o) {
+    const double most = std::min(novel * s.usual_unknown, 1 - (1 - s.usual_unknown) / 4);
+    const double away = std::min(std::max((s.unknown - most) / std::max(1 - most, 1e-9), 0.), 1.);
+    const double middle = in_units(r, s, o, s.level[o]);
+    const double far = square(s.mean[o] - middle) + (constant(s, o) ? 1 : square(s.wide[o] / scale_of(r, s, n + o)));
+    const double near = s.variance[o] = std::max(s.variance[o], constant(s, o) ? still : 0);
+    s.variance[o] = near + away * std::max(far - near, 0.);
+    s.weight[o] = near < far ? (1 - away) * near / s.variance[o] : 1;
 }
 
 // The mixture of what the members say of an output, its correction, and its variance; within low and high.
@@ -259,6 +279,7 @@ static void mix(const Rules &r, Stream &s, int o, double low, double high) {
     s.mean[o] = mixed(blends);
     second += square(s.mean[o] - first);
     s.variance[o] = std::max(second, r.floor * s.pace[o]) * s.calibration[o];
+    let_go(r, s, o);
 }
 
 static double student(const Rules &r, double error, double variance) {
@@ -317,12 +338,13 @@ static void judge_members(const Rules &r, Stream &s, int o, double value) {
     const double t = s.clock, error = value - s.mean[o], blended = value - s.blend[o][0];
     learn_correction(r, s, o, blended);
     learn_map(r, s, o, value);
-    const double z2 = error * error / std::max(s.variance[o] / s.calibration[o], 1e-300);
-    const double surprised = std::min(z2, surprise * s.calibration[o]) - s.calibration[o], since = t - r.uncalibrated;
+    const double z2 = error * error / std::max(s.variance[o], 1e-300), since = t - r.uncalibrated;
+    const double row = std::pow(surprise, s.surprises[o]);  // each in a row may be so many times larger
+    const double surprised = std::min(std::max(s.weight[o] * (z2 - 1), -1.), surprise * row - 1) * s.calibration[o];
     if (since > 0) s.calibration[o] += std::max(r.error_rate, 1 / (since + 5)) * surprised;
     s.calibration[o] = std::min(std::max(s.calibration[o], 1e-6), 1e2);
     auto follow = [&](double &running, double found, double rate, double most) {
-        running += std::max(rate, 1 / (t + 1)) * (std::min(found, most * running) - running);
+        running = std::max(running + std::max(rate, 1 / (t + 1)) * (std::min(found, most * row * running) - running), least);
     };
     double scores[members], over[clocks], of_blends[blends], least_square = infinity;
     for (int b = 0; b < blends; ++b) {
@@ -342,13 +364,14 @@ static void judge_members(const Rules &r, Stream &s, int o, double value) {
         double &excess = s.excess[o][i], &usual = s.usual[o][i];
         usual += std::max(r.members_rate, 1 / (t + 1)) * (std::log(std::max(v, least)) - usual);
         scores[i] = score(r, e, v * excess, s.error[o]);
-        excess += std::max(r.members_rate, 1 / (t + 3)) * (std::min(ratio, surprise * excess) - excess);
+        excess += std::max(r.members_rate, 1 / (t + 3)) * (std::min(ratio, surprise * row * excess) - excess);
         excess = std::min(std::max(excess, r.least), 1e8);
         const int l = i - locals - carried;
         if (l < 0 || l >= lanes) continue;
         double &size = s.quadratic_error[o][l];
-        size = std::max(size * (1 + std::max(r.pace, 1 / (t + 2)) * (std::min(ratio, surprise) - 1)), 1e-26);
+        size = std::max(size * (1 + std::max(r.pace, 1 / (t + 2)) * (std::min(ratio, surprise * row) - 1)), 1e-26);
     }
+    s.surprises[o] = z2 > surprise ? std::min(s.surprises[o] + 1, 40.) : 0;
     for (int c = 0; c < clocks; ++c) {
         over[c] = score(r, value - s.mixed[o][c], s.mixed_variance[o][c], s.error[o]);
         reweigh(s.weights[o][c], scores, members, r.discounts[c], r.share);
