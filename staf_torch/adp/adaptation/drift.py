@@ -122,12 +122,11 @@ class StreamDrift:
         self.windows = IntegralWindows(plant, length, noise=noise)
 
     def init(self, x: Tensor) -> DriftEstimate:
-        """Return the prior around the states (..., n)."""
+        """Return the prior around the states (..., n), around the equilibrium in what is NaN."""
+        x = torch.where(x.isnan(), self.center.to(x), x)
         count = self.offsets.numel()
         identity = torch.eye(count, dtype=x.dtype, device=x.device).expand(*x.shape[:-1], count, count)
-        return DriftEstimate(
-            x.clone(), x.new_zeros(*x.shape[:-1], len(self.rows), count), identity.contiguous()
-        )
+        return DriftEstimate(x, x.new_zeros(*x.shape[:-1], len(self.rows), count), identity.contiguous())
 
     def window_of(self, estimate: DriftEstimate) -> IntegralWindows:
         """The windows whose equations are of this estimate's weights."""

@@ -132,7 +132,7 @@ class ClosedLoop(nn.Module):
             spent = spent * torch.exp(-self.cost.discount * self.dt * state.lived)
         cost = state.cost + torch.where(alive, spent, 0.0)
         bent = torch.where(state.alive & ~(bent <= state.bent), bent, state.bent)  # also what is not a number
-        reach = torch.maximum(state.reach, state.x.abs().amax(-1))
+        reach = torch.maximum(state.reach, wrap(state.x, self.system.periodic).abs().amax(-1))
         return LoopState(_where(alive, x, state.x), cost, alive, state.lived + alive, bent, reach, kept), u
 
     def _advance(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -312,7 +312,7 @@ class Holding:
         each, and of the cost."""
         (after, paid), (better, due) = self(x, u), self.finer(2)(x, u)
         rest = self._rest().to(x)
-        size = torch.maximum((x - rest).abs().amax(-1), (better - rest).abs().amax(-1))
+        size = torch.stack([self.plant.difference(at, rest).abs().amax(-1) for at in (x, better)]).amax(0)
         least = _LEAST * (1 + float(rest.abs().max()))
         rate = due.abs() if self.cost is None else self.dt * self.cost.rate(x, u).abs() + due.abs()
         wrong = (after - better).abs().amax(-1)
