@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from pathlib import Path
 from typing import NamedTuple
 
@@ -66,8 +67,9 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
             measured |= {f"{what}_{key}": float(value) for key, value in parts.items()}
         study.add(f"{name}_", measured, method=name)
     for what, of in rms.items():
-        study.metrics[f"integral_better_{what}"] = float((of["integral"] < of["derivative"]).double().mean())
-    shown = int(rms["parameter_error"]["integral"].argmin())
+        ours, theirs = (of[name].nan_to_num(math.inf, math.inf) for name in ("integral", "derivative"))
+        study.metrics[f"integral_better_{what}"] = float((ours < theirs).double().mean())
+    shown = int(rms["parameter_error"]["integral"].nan_to_num(math.inf, math.inf).argmin())
     picture = GainSets(
         time=time.numpy(),
         parameters=found["integral"].theta[shown].numpy(),

@@ -148,7 +148,8 @@ def summary(memory: ExperienceMemory, region: Region, again: Revisits) -> Metric
     found: Metrics = {"models": float(memory.count.max())}
     found["covered_fraction"] = float((~region.errors["memory"].isnan()).double().mean())
     for name, error in region.errors.items():
-        covered = ~error.isnan()
+        # where the memory does not reach is NaN; of the others that is an error
+        covered = ~error.isnan() if name == "memory" else torch.ones_like(error, dtype=torch.bool)
         total = torch.where(covered, error.square(), 0.0).sum((1, 2)) / covered.sum((1, 2))
         found[f"{name}_rms_error"] = finite(total.sqrt().max())
         found[f"{name}_max_error"] = finite(torch.where(covered, error, 0.0).max())

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import abc
 import inspect
+import math
 import numbers
 import sys
+import warnings
 from typing import Any, Protocol, Self
 
 import numpy as np
@@ -53,14 +55,41 @@ class ScikitEstimator:
     def score(self, x: Any, y: Any, sample_weight: Any = None) -> float:
         """R^2 of the prediction at x, (P, n), as scikit-learn's regressors have it.
 
-        The mean over the outputs; of constant targets 1 where they are met exactly, else 0.
+        The mean over the outputs; of constant targets 1 where they are met exactly, else 0. Targets that are
+        not finite were not measured and are left out, as in learning; a prediction that is not finite makes
+        the score NaN, and so does an output without a finite target, with a warning.
+
+        Args:
+            x: (P, n).
+            y: (P,), or (P, K) for K outputs.
+            sample_weight: (P,), finite and not negative, not all zero; ones by default.
+
+        Raises:
+            ValueError: for another shape, or for weights that are none.
         """
         truth, found = np.asarray(y, np.float64), np.asarray(self.predict(x), np.float64)  # type: ignore[attr-defined]
+        call = f"{type(self).__name__}.score"
+        if truth.shape != found.shape:
+            raise ValueError(f"`{call}(y=...)` must have the shape {found.shape}; got {truth.shape}.")
         weight = np.ones(len(truth)) if sample_weight is None else np.asarray(sample_weight, np.float64)
-        weight = weight.reshape(len(truth), 1) if truth.ndim > 1 else weight.ravel()
-        total = (weight * (truth - np.average(truth, 0, weight.ravel())) ** 2).sum(0)
-        left = (weight * (truth - found) ** 2).sum(0)
-        return float(np.mean(1 - np.where(total > 0, left / np.where(total > 0, total, 1), left > 0)))
+        if weight.size != len(truth) or not (np.isfinite(weight) & (weight >= 0)).all() or weight.sum() == 0:
+            rule = f"must be ({len(truth)},), finite, not negative and not all zero"
+            raise fail(call, "sample_weight", rule, sample_weight)
+        seen = np.isfinite(truth)
+        weight = np.where(seen, weight.reshape(len(truth), *[1] * (truth.ndim - 1)), 0.0)
+        truth, whole = np.where(seen, truth, 0.0), weight.sum(0)
+        if (whole == 0).any():
+            warnings.warn(
+                f"`{call}(y=...)` has an output without a finite target: the score is NaN", stacklevel=2
+            )
+            return math.nan
+        total = (weight * (truth - (weight * truth).sum(0) / whole) ** 2).sum(0)
+        inside = weight > 0
+        spread = np.where(inside, truth, -np.inf).max(0) - np.where(inside, truth, np.inf).min(0)
+        total = np.where(spread > 0, total, 0.0)  # the mean of equal numbers may be rounded
+        left = (weight * (truth - np.where(inside, found, 0.0)) ** 2).sum(0)
+        met = np.where(np.isnan(left), left, left > 0)
+        return float(np.mean(1 - np.where(total > 0, left / np.where(total > 0, total, 1), met)))
 
     def __repr__(self) -> str:
         arguments = ", ".join(f"{name}={value!r}" for name, value in self.get_params(deep=False).items())

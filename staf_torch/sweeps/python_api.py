@@ -28,6 +28,7 @@ from ..results.reader import Collection, Value, collect, identity, read_record
 from ..results.run_directory import History
 from ..results.untrusted import UnreadableError, read_bytes
 from ..tables import Layout, Style, Table, html_text, tabulate
+from ..tables.aggregate import lost_share
 from ..tables.columns import significant
 from ..tables.model import data_frame, require
 from . import callbacks
@@ -355,14 +356,16 @@ class Runs:
     def best(self, metric: str) -> Run:
         """Return the run with the best number of a metric: the smallest, unless larger is better.
 
+        Metrics are of the trajectories that did not diverge: only runs that lost the least of them count.
+
         Raises:
             ValueError: if no run has a number of that name.
         """
         choice("Runs.best", "metric", metric, self.found.metrics)
-        first = self.sort(metric)[0]
-        if first.metrics.get(metric) is None:
-            raise fail("Runs.best", "metric", f"has no number: {first.absence(metric)}", metric)
-        return first
+        ordered = self.sort(metric)
+        if ordered[0].metrics.get(metric) is None:
+            raise fail("Runs.best", "metric", f"has no number: {ordered[0].absence(metric)}", metric)
+        return min(ordered, key=lambda run: lost_share(run, metric))  # the first of equals
 
     def to_pandas(self) -> DataFrame:
         """Return a pandas `DataFrame` with a row a run: swept settings, all metrics, status and directory.

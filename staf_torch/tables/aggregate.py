@@ -210,7 +210,7 @@ def _one_a_run(found: Collection, metrics: Sequence[str]) -> Table:
     for run in found.rows:
         cells = {c.name: run.metrics.get(c.name) if c.metric else run.value(c.name) for c in columns}
         reasons = {name: run.absence(name) for name in metrics if cells[name] is None}
-        rows.append(Row(cells, reasons))
+        rows.append(Row(cells, reasons, {name: lost_share(run, name) for name in metrics}))
     return Table(tuple(columns), tuple(rows))
 
 
@@ -256,6 +256,7 @@ def _row(
 ) -> Row:
     cells: dict[str, Value] = {key: runs[0].value(key) for key in keys}
     reasons: dict[str, str] = {}
+    lost: dict[str, float] = {}
     places = grouped(runs, lambda run: place(run, spread))
     for column in columns:
         if column.metric is None or column.statistic is None:
@@ -265,11 +266,17 @@ def _row(
         if column.statistic in ("n", "failed"):
             cells[column.name] = len(numbers) if column.statistic == "n" else len(here) - len(numbers)
             continue
+        lost[column.name] = mean([lost_share(run, column.metric) for run in here])
         cells[column.name] = AGGREGATES[column.statistic](numbers) if numbers else None
         if cells[column.name] is None:
             reasons[column.name] = _why(here, column.metric)
     cells["reasons"] = "; ".join(dict.fromkeys(_absences(runs, columns))) or None
-    return Row(cells, reasons)
+    return Row(cells, reasons, lost)
+
+
+def lost_share(run: RecordedRun, metric: str) -> float:
+    """Return the share of a run's trajectories that a metric does not speak of: 1 where it is missing."""
+    return 1.0 if run.metrics.get(metric) is None else run.metrics.get("diverged_fraction") or 0.0
 
 
 def _why(runs: Sequence[RecordedRun], metric: str) -> str:
@@ -302,8 +309,8 @@ def _sorted(table: Table, names: Sequence[str]) -> list[Row]:
     for name in reversed(names):  # stable: the last sort is by the first name
         column, largest = _column(table, name.removesuffix(_ASCENDING).removesuffix(_DESCENDING))
         descending = name.endswith(_DESCENDING) or (largest and not name.endswith(_ASCENDING))
-        present = [row for row in rows if row.cells.get(column) is not None]
-        missing = [row for row in rows if row.cells.get(column) is None]
+        present = [row for row in rows if _there(row.cells.get(column))]
+        missing = [row for row in rows if not _there(row.cells.get(column))]
         present.sort(key=lambda row: _key(row.cells[column]), reverse=descending)
         rows = present + missing
     return rows
@@ -315,6 +322,10 @@ def _column(table: Table, name: str) -> tuple[str, bool]:
         if name in (column.name, column.metric):
             return column.name, column.larger_is_better
     raise fail(TABLE_COMMAND, "sort", _one_of(table.names), name)
+
+
+def _there(value: Value) -> bool:
+    return value is not None and not (isinstance(value, float) and math.isnan(value))
 
 
 def _key(value: Value) -> tuple[bool, float, str]:

@@ -33,6 +33,8 @@ class Row:
 
     cells: Mapping[str, Value]  # by the names of the columns
     reasons: Mapping[str, str] = dataclasses.field(default_factory=dict)  # name of a column -> why it is None
+    # name of a column -> share of the runs and trajectories that its number does not speak of
+    lost: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,7 +104,7 @@ def printed(columns: Sequence[Column], rows: Sequence[Row], style: Style) -> lis
     for column in columns:
         cells = tuple(_cell(row.cells.get(column.name)) for row in rows)
         if column.shown and column.statistic is None:
-            best = _best(cells, column, style)
+            best = _best(cells, column, rows, style)
             name = "" if column.heading else column.name
             measured = column.metric is not None
             found.append(PrintedColumn(column.heading or column.name, "", cells, best, name, measured))
@@ -136,7 +138,9 @@ def _aggregated(columns: Sequence[Column], rows: Sequence[Row], style: Style) ->
             alone = at and len(shown) == 1  # the statistic joins the heading above
             heading = ", ".join(filter(None, (at or metric, "" if alone else what)))
             over = ", ".join(filter(None, (metric, what if alone else ""))) if at else ""
-            yield PrintedColumn(heading, over, cells, _best(cells, column, style), metric, True, at, what)
+            yield PrintedColumn(
+                heading, over, cells, _best(cells, column, rows, style), metric, True, at, what
+            )
 
 
 def _joined(cells: Mapping[str, Value], column: Column, spread: Column | None) -> Number | None:
@@ -162,12 +166,15 @@ def _range(counts: Sequence[Value]) -> Number | str:
     return Number(least) if least == most else f"{least}-{most}"
 
 
-def _best(cells: Sequence[Number | str | None], column: Column, style: Style) -> frozenset[int]:
-    """The rows of the best number and of all that look the same."""
-    numbers = [cell for cell in cells if isinstance(cell, Number)]
-    if column.metric is None or not style.bold or len(numbers) < 2:
+def _best(
+    cells: Sequence[Number | str | None], column: Column, rows: Sequence[Row], style: Style
+) -> frozenset[int]:
+    """The rows of the best number and of all that look the same, among those that lost the least."""
+    values = {k: c.value for k, c in enumerate(cells) if isinstance(c, Number) and not math.isnan(c.value)}
+    if column.metric is None or not style.bold or len(values) < 2:
         return frozenset()
-    chosen: Callable[..., Number] = max if column.larger_is_better else min
-    best = significant(chosen(numbers, key=lambda number: number.value).value, style.digits)
-    look = [significant(c.value, style.digits) if isinstance(c, Number) else None for c in cells]
-    return frozenset(row for row, text in enumerate(look) if text == best)
+    lost = {k: rows[k].lost.get(column.name, 0.0) for k in values}
+    values = {k: value for k, value in values.items() if lost[k] == min(lost.values())}
+    chosen: Callable[..., float] = max if column.larger_is_better else min
+    best = significant(chosen(values.values()), style.digits)
+    return frozenset(k for k, value in values.items() if significant(value, style.digits) == best)
