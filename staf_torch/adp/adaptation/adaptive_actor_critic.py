@@ -114,9 +114,8 @@ class AdaptiveActorCritic(Controller):
         estimate = self.law.init(x0)
         if self.known is not None:
             pairs = zip(self.known[:-1], estimate[:-1], strict=True)  # all but what was missed
-            estimate = Estimate(
-                *(part.to(x0).expand(like.shape).clone() for part, like in pairs), estimate[-1]
-            )
+            learned = (part.to(x0).expand(like.shape).clone() for part, like in pairs)
+            estimate = Estimate(*learned)._replace(missed=estimate.missed)
         window = self.windows.init(x0)
         window = self.windows.holding(window, self.learner.cost.input_of(window.u))
         return LearnedModel(self.learner.init(x0), estimate, torch.zeros_like(x0[:, 0]), window)

@@ -126,6 +126,13 @@ def test_an_adaptive_controller_holds_counts_and_learns_on_where_measurements_ar
     assert float(lossy.state[1, -1].norm()) < float(lossy.state[1, 0].norm())
 
 
+def test_a_drift_begins_also_where_the_first_measurement_was_missing() -> None:
+    known = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
+    drift = adp.StreamDrift(known, GaussianKernel(2.0), 0.5 * rings(3), rows=[1], deviation=10.0, length=0.05)
+    lost = drift.init(tensor([[LOST, 0.3]]))
+    assert lost.anchor.tolist() == [[0.0, 0.3]]
+
+
 def test_a_window_with_a_missing_measurement_gives_no_equation() -> None:
     for windows in (adp.IntegralWindows(PENDULUM, 0.04), adp.SlopeWindows(PENDULUM, 0.04)):
         now, ready, u = windows.init(torch.zeros(2, 2).double()), [], torch.ones(2, 1).double()

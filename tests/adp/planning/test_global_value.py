@@ -192,6 +192,15 @@ def followed(known: adp.GlobalValue, x: Tensor, entry: int) -> tuple[float, Tens
     return paid + value + float(model[N + 1 : 2 * N + 1] @ d + 0.5 * d @ bent @ d), u, True
 
 
+def test_a_row_without_numbers_has_no_control_and_leaves_the_others_theirs(known: adp.GlobalValue) -> None:
+    x = tensor([3.0, 0.9]) * uniform(3, N, seed=8)
+    healthy = known(x[[0, 2]])
+    x[1, 0] = math.nan
+    found = known(x)
+    assert torch.equal(found[[0, 2]], healthy)
+    assert bool(found[1].isnan().all())
+
+
 def test_the_cheapest_of_the_nearest_plans_is_followed(known: adp.GlobalValue) -> None:
     x = tensor([3.0, 0.9]) * uniform(6, N, seed=7)
     x[3] += tensor([2 * math.pi, 0.0])
