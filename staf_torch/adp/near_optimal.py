@@ -15,8 +15,8 @@ from ..approximation.basis import StaFBasis
 from ..centers import StateFollowingCenters, cross_polytope
 from ..kernels import ExponentialKernel
 from ..lanes import ready, where_rows
-from ..numerics.checks import choice, fail, flag, positive_real
-from ..systems import Clocked, Plant
+from ..numerics.checks import choice, flag, positive_real
+from ..systems import Plant
 from ..systems.bounds import Limit
 from .loop.controller import LQR, Controller, Feedback
 from .loop.simulation import simulate
@@ -26,7 +26,8 @@ from .planning.shooting import DirectShooting
 from .policies.rollout import ball_directions
 from .policies.sampled_rollout import SampledRollout
 from .problem.cost import Cost
-from .problem.held_linear import HeldLoop, held_stability
+from .problem.held_linear import held_stability
+from .problem.rules import check_endless, check_still, held_period, regulated, slowest, warn_if_short
 from .problem.sampled import SampledProblem
 from .reach import Reach, arrived, box_of, drawn, extended
 
@@ -119,7 +120,8 @@ class NearOptimal(SampledRollout):
             return None
         steps = self.steps
         if constants is not None:
-            steps = max(steps, _periods(constants / _slowest(self.lqr, self.plant), self.period))
+            decay = slowest(self.lqr, self.plant, self.cost, self.period)
+            steps = max(steps, _periods(constants / decay, self.period))
         key = steps, self.plant, self.cost
         if key not in self._planners:
             problem = SampledProblem.of(self.plant, self.cost, dt=self.period)
@@ -200,7 +202,7 @@ class NearOptimal(SampledRollout):
     @property
     def settles(self) -> int:
         """Periods after which the slowest mode of the LQR has fallen to 1e-4, or plans have arrived."""
-        periods = math.ceil(_SETTLED / _slowest(self.lqr, self.plant) / self.period)
+        periods = math.ceil(_SETTLED / slowest(self.lqr, self.plant, self.cost, self.period) / self.period)
         return periods if self.memory is None else max(periods, 2 * self.memory.library.control.shape[1])
 
     def _good(self, fine: Tensor, states: int, width: float, seed: int) -> float:
@@ -304,21 +306,18 @@ def near_optimal(
             is no global value; the message says why.
     """
     choice("near_optimal", "reach", reach, _WAYS)
-    held = plant.period if dt is None else dt
-    period = positive_real("near_optimal", "dt", held)
-    if isinstance(plant, Clocked):
-        rule = "must have no clock: a path is followed by `RecedingHorizon` or `LQR`"
-        raise fail("near_optimal", "plant", rule, plant)
-    if cost.end is not None:
-        rule = "must have no terminal cost, as the policy knows no end: plans do, `RecedingHorizon`"
-        raise fail("near_optimal", "cost", rule, cost.end)
-    placed = cost.bounded(low, high).around(plant)
+    period = held_period("near_optimal", plant, dt)
+    check_still("near_optimal", "plant", plant, "`RecedingHorizon` or `LQR`")
+    check_endless("near_optimal", "cost", cost.ending, "the policy knows no end; plans do, `RecedingHorizon`")
+    placed = regulated("near_optimal", plant, cost.bounded(low, high))
     lqr = LQR(plant, placed, period=period)
+    decay = slowest(lqr, plant, placed, period)
     constants = _PLANNED if flag("near_optimal", "plan", plan) else _DECAY
     if horizon is None:
-        steps = _periods(constants / _slowest(lqr, plant), period)
+        steps = _periods(constants / decay, period)
     else:
         steps = round(positive_real("near_optimal", "horizon", horizon) / period)
+        warn_if_short("near_optimal", "horizon", horizon, decay)
     corners = cross_polytope(placed.inputs)
     along = torch.cat((corners, torch.zeros_like(corners[:1])))
     directions = along if placed.inputs <= placed.dim else ball_directions(None, placed.dim)
@@ -358,13 +357,6 @@ def _warn_if_slow(policy: NearOptimal) -> None:
         "it cannot run beside the plant" if taken > policy.period else "a slower moment and it is late",
         policy.steps,
     )
-
-
-def _slowest(lqr: LQR, plant: Plant) -> float:
-    """The decay of the slowest mode of the held LQR's loop, 1/s."""
-    assert lqr.period is not None
-    radius = HeldLoop.of(lqr, plant, at=lqr.cost.target).spectral_radius(lqr.period)
-    return -math.log(max(min(radius, 1 - 1e-9), 1e-9)) / lqr.period
 
 
 def _median(values: Tensor) -> float | None:

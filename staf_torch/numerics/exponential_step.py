@@ -21,6 +21,7 @@ from ..lanes import scan
 from .linalg import exponential
 
 _NEAR = 4.0  # an error that doubling the steps divides by less is one of rounding, or of a rate with corners
+_MOSTLY, _DOUBLINGS, _BOUNDED = 0.75, 2, 0.5  # share of the samples; doublings since; relative error
 _SMALL = 1e-3  # relative errors above which more steps are tried all the same
 
 
@@ -154,22 +155,25 @@ def fewest_steps(errors: Callable[[int], Tensor], tolerance: float, most: int) -
     """Return the fewest steps of fourth order for which all samples are accurate.
 
     An error that no longer falls with the steps is one of rounding or of a rate with corners: the search
-    ends there.
+    ends there. Nor do more steps help where most samples are accurate long since and others, which cross a
+    jump of the rate, are not.
 
     Args:
         errors: of so many steps, by step doubling, (P,).
         tolerance: of them.
         most: steps.
     """
-    count, last = 1, math.inf
+    count, last, served = 1, math.inf, 0
     while True:
         each = errors(count)
         error = float(each.max()) if len(each) else 0.0
+        served += bool(len(each)) and bool(each.quantile(_MOSTLY, interpolation="lower") <= tolerance)
         if error <= tolerance:
             if math.isfinite(last):  # perhaps fewer: the error falls with the fourth power of the steps
                 count = max(count // 2 + 1, math.ceil(count * (error / tolerance) ** 0.25))
             return StepCount(count, error)
-        if stalls(error, last) or 2 * count > most:
+        jumps = served > _DOUBLINGS and error <= _BOUNDED and error * _NEAR > last
+        if jumps or stalls(error, last) or 2 * count > most:
             return StepCount(count, error)
         count, last = 2 * count, error
 

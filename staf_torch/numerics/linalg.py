@@ -190,6 +190,20 @@ def row_jacobian(function: Callable[[Tensor], Tensor], at: Tensor) -> tuple[Tens
     return values, torch.stack(rows, dim=-2).unflatten(-2, outputs)
 
 
+def slope_of(values: Tensor, at: Tensor, *, create_graph: bool = False) -> Tensor:
+    """The derivative of the sum of values with respect to ``at``: 0 where they do not depend on it.
+
+    Args:
+        values: of `torch` operations on ``at``, also of none.
+        at: with ``requires_grad``.
+        create_graph: whether the result is differentiated again; else the graph is kept for others.
+    """
+    if not values.requires_grad:
+        return torch.zeros_like(at)
+    kept = {"create_graph": True} if create_graph else {"retain_graph": True}
+    return torch.autograd.grad(values.sum(), at, materialize_grads=True, **kept)[0]
+
+
 def exponential(matrix: Tensor) -> Tensor:
     """e^A: (..., n, n).
 

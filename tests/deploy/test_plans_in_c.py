@@ -14,7 +14,7 @@ from helpers_swingup import double_integrator, pendulum
 from torch import Tensor
 
 from staf_torch import adp, deploy, systems
-from staf_torch.adp.planning.ddp import Trajectories
+from staf_torch.adp.planning.trajectories import Trajectories
 from staf_torch.deploy.c_header import runner_c, runner_learning_c
 
 needs_cc = pytest.mark.skipif(

@@ -14,6 +14,7 @@ from ..loop.controller import LQR, Controller, Policy
 from ..planning.ddp import chosen
 from ..policies.rollout import RolloutPolicy, fitted_slope
 from ..problem.cost import Cost, matvec, quadratic
+from ..problem.rules import regulated
 from .consider import Considered, ConsiderFilter
 from .least_squares import Estimate, LeastSquares
 from .parametric import ParametricPlant
@@ -97,7 +98,7 @@ class AdaptiveLQR(Controller):
         filter: ConsiderFilter | None = None,
     ) -> None:
         super().__init__()
-        self.model, self.cost = model, cost.around(model)
+        self.model, self.cost = model, regulated("AdaptiveLQR", model, cost)
         p = model.parameters_count
         if len(law.first) != p:
             raise fail("AdaptiveLQR", "law", f"must have the model's {p} parameters", len(law.first))

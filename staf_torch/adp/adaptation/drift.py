@@ -18,6 +18,7 @@ from ...systems import ControlAffineSystem
 from ..loop.controller import LQR, Controller, Policy
 from ..planning.ddp import chosen
 from ..problem.cost import Cost, matvec, quadratic
+from ..problem.rules import regulated
 from .parametric import ParametricPlant
 from .redesign import Redesign
 from .windows import Equation, IntegralWindows, Window
@@ -293,7 +294,8 @@ class DriftLQR(Controller):
         doublings: int = 14,
     ) -> None:
         super().__init__()
-        self.drift, self.model, self.cost = drift, drift.known, cost.around(drift.known)
+        self.drift, self.model = drift, drift.known
+        self.cost = regulated("DriftLQR", drift.known, cost)
         self.confidence = positive_real("DriftLQR", "confidence", confidence)
         self.redesign = Redesign("DriftLQR", self.cost, doublings)
         self.robust: Policy = LQR(drift.known, cost) if robust is None else robust

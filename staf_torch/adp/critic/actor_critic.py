@@ -13,6 +13,7 @@ from ...numerics.checks import copied, fail, positive, trailing, vector
 from ...systems import ControlAffineSystem
 from ..loop.controller import Controller
 from ..problem.cost import Cost
+from ..problem.rules import regulated
 from .bases import ValueBasis
 from .bellman import BellmanTerms, bellman_terms
 from .extrapolation import Extrapolation
@@ -75,7 +76,7 @@ class ActorCritic(Controller):
                 f"`ActorCritic(basis=...)` has {basis.dim} states, but the plant has {model.dim}."
             )
         _check_points(extrapolation, basis.dim)
-        cost = cost.around(model)
+        cost = regulated("ActorCritic", model, cost)
         if cost.target is not None or cost.discount:
             what = "discount" if cost.discount else "target"
             rule = f"must have no {what}: the laws regulate to the origin without a discount"

@@ -16,6 +16,7 @@ from ...numerics.linalg import riccati
 from ...systems import Plant
 from ..problem.cost import Cost, matvec, quadratic
 from ..problem.held_linear import held_riccati
+from ..problem.rules import regulated
 
 Policy = Callable[[Tensor], Tensor]
 """u from x: (..., n) -> (..., m)."""
@@ -207,13 +208,13 @@ class LQR(nn.Module):
         k: K, (m, n).
 
     Raises:
-        ValueError: if the plant does not rest at the set-point, its linearisation cannot be stabilised, or
-            the cost does not see a mode that does not decay.
+        ValueError: if the plant does not rest at the set-point under an input within the bounds, its
+            linearisation cannot be stabilised, or the cost does not see a mode that does not decay.
     """
 
     def __init__(self, system: Plant, cost: Cost, period: float | None = None) -> None:
         super().__init__()
-        self.cost = cost.around(system)
+        self.cost = regulated("LQR", system, cost)
         self.period = system.period if period is None else period
         system, still = self.cost.regulated(system)
         if self.period is None:

@@ -16,8 +16,8 @@ from ...lanes.tree import flatten, unflatten
 from ...numerics.checks import choice, copied, fail, integer, positive_real, trailing
 from ...systems import ControlAffineSystem, Plant
 from ..problem.cost import Cost
-from ..problem.held_linear import HeldLoop
 from ..problem.held_plant import RESOLVED, Holding, Substeps, fewest_and_most
+from ..problem.rules import warn_if_restless, warn_if_unstable
 from .accuracy import BENT, largest_moves, needed, warn_of_errors
 from .controller import Carried, Controller, Feedback, Policy
 from .step import ClosedLoop, LoopState, program, record, row_numbers
@@ -153,7 +153,8 @@ def simulate(
         progress: called with the number of steps done since its last call.
 
     Raises:
-        ValueError: if an argument breaks its rule, the plant does not rest at 0 or returns another shape.
+        ValueError: if an argument breaks its rule, or the plant returns another shape. A set-point at which
+            no input within the bounds holds the plant is a warning in the log.
     """
     if not isinstance(controller, Controller):
         if not callable(controller):
@@ -258,27 +259,6 @@ class _Run:
         return LoopResult(result.time, *unflatten(structure, iter(whole)))
 
 
-def warn_if_unstable(policy: Policy, system: Plant, cost: Cost, dt: float) -> float:
-    """Say in the log that the linearised loop of a policy held for dt is not stable, and which period is.
-
-    Returns:
-        The fastest mode of the linearised plant without control, 1/s; inf where it is not known.
-    """
-    held = HeldLoop.of(policy, system, at=cost.set_point())
-    radius = held.spectral_radius(dt)
-    fastest = float(torch.linalg.eigvals(held.f).abs().max()) if held.finite else math.inf
-    if not radius >= 1:
-        return fastest
-    most = held.largest_period()
-    remedy = "at no period" if most is None else f"up to {most:.4g} s"
-    _log.warning(
-        "the control is held for dt = %.4g s, at which the linearised loop has the spectral radius %.4g: it "
-        "is unstable; it is stable %s. `LQR(plant, cost, period=dt)` is made to be held.",
-        *(dt, radius, remedy),
-    )
-    return fastest
-
-
 def _run(
     loop: ClosedLoop,
     steps_of: Program,
@@ -350,4 +330,6 @@ def _check(system: Plant, cost: Cost, x0: Tensor) -> Cost:
                 f"`{name}.{method}` must map {tuple(x0.shape)} to {tuple(shape)} "
                 f"(the cost is for {inputs} inputs); got {got}."
             )
-    return cost.around(system)
+    placed = cost.around(system)
+    warn_if_restless("simulate", system, placed)
+    return placed

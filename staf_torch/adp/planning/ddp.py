@@ -11,7 +11,7 @@ Source: Tassa, Mansard and Todorov, "Control-limited differential dynamic progra
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,6 +21,17 @@ from ...numerics.box import minimum_and_slopes
 from ...numerics.checks import fail, integer, positive_real, trailing
 from ...numerics.riccati import riccati_step
 from ..problem.sampled import Derivatives, SampledProblem
+from .trajectories import (
+    CostedTrajectories,
+    End,
+    EndFunction,
+    LocalModel,
+    Reference,
+    Trajectories,
+    chosen,
+    first_controls,
+    rows_of,
+)
 
 LENGTHS = (1.0, 0.5, 0.2, 0.07, 0.02)  # shares of a step that are tried side by side
 EASIER, HARDER = 0.4, 8.0  # what success and failure do to the regularisation of a row
@@ -29,101 +40,7 @@ LEAST, FIRST, TRUSTED, MOST = 1e-9, 1e-3, 1.0, 1e9
 CONVERGED = -1.0
 _ROUNDED = 4.0
 _NUMBERS = 2**25  # second derivatives that are held at once
-
-
-class Trajectories(NamedTuple):
-    """Trajectories and the local models of the value along them: V(x) ~ V + g'd + d'Hd/2, d = x - x_k."""
-
-    state: Tensor  # (B, T + 1, n), angles as the step returned them
-    control: Tensor  # (B, T, m)
-    feedback: Tensor  # du/dx, (B, T, m, n); 0 where a bound holds
-    value: Tensor  # cost from x_k on, (B, T + 1)
-    gradient: Tensor  # g, (B, T + 1, n)
-    curvature: Tensor  # H, (B, T + 1, n, n)
-    converged: Tensor  # (B,) bool: no step promises or brings a gain of tolerance, or one above rounding
-
-    @property
-    def cost(self) -> Tensor:
-        """(B,)."""
-        return self.value[:, 0]
-
-
-class Reference(NamedTuple):
-    """Trajectory and feedback that a control is applied around."""
-
-    state: Tensor  # (B, T, n)
-    feedback: Tensor  # (B, T, m, n)
-
-
-class LocalModel(NamedTuple):
-    """V(x) ~ v + g'd + d'Hd/2 with d = x - state by the shorter way around, a row each."""
-
-    state: Tensor  # (B, n)
-    value: Tensor  # v, (B,)
-    gradient: Tensor  # g, (B, n)
-    curvature: Tensor  # H, (B, n, n)
-
-    def at(self, problem: SampledProblem, x: Tensor) -> Tensor:
-        """V at L states a row: (B, L, n) -> (B, L)."""
-        d = problem.offset(x, self.state.unsqueeze(1))
-        bent = (self.curvature.unsqueeze(1) * d.unsqueeze(-2)).sum(-1)
-        return self.value.unsqueeze(1) + ((self.gradient.unsqueeze(1) + 0.5 * bent) * d).sum(-1)
-
-    def slope(self, problem: SampledProblem, x: Tensor) -> Tensor:
-        """Its gradient at a state a row: (B, n) -> (B, n)."""
-        d = problem.offset(x, self.state)
-        return self.gradient + (self.curvature * d.unsqueeze(-2)).sum(-1)
-
-
-class CostedTrajectories(NamedTuple):
-    """Trajectories without their models."""
-
-    state: Tensor  # (B, T + 1, n)
-    control: Tensor  # (B, T, m)
-    cost: Tensor  # (B,)
-    paid: Tensor  # of every step, and at last the terminal value, (B, T + 1)
-
-
-def packed(state: Tensor, control: Tensor, feedback: Tensor) -> Tensor:
-    """Steps of a plan as numbers: (..., n), (..., m), (..., m, n) -> (..., n + m + m n)."""
-    return torch.cat((state, control, feedback.flatten(-2)), dim=-1)
-
-
-def unpacked(problem: SampledProblem, steps: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """State, control and feedback of `packed` steps."""
-    n, m = problem.dim, problem.inputs
-    state, control, feedback = steps.split((n, m, m * n), dim=-1)
-    return state, control, feedback.unflatten(-1, (m, n))
-
-
-def resting(problem: SampledProblem, goal: Tensor) -> Tensor:
-    """The linear feedback of goals (..., n) as `packed` steps."""
-    shape = goal.shape[:-1]
-    return packed(goal, problem.rest.expand(*shape, -1), (-problem.k).expand(*shape, -1, -1))
-
-
-def around(problem: SampledProblem, x: Tensor, step: Tensor) -> Tensor:
-    """The control of a `packed` step at another state than its own: (..., n), (..., w) -> (..., m)."""
-    state, control, feedback = unpacked(problem, step)
-    return problem.admissible(control + (feedback * problem.offset(x, state).unsqueeze(-2)).sum(-1))
-
-
-Some = TypeVar("Some", bound=tuple[Tensor, ...])
-
-
-def rows_of(parts: Some, index: Tensor) -> Some:
-    """Some of the rows of a named tuple."""
-    return type(parts)(*(part[index] for part in parts))
-
-
-def chosen(rows: Tensor, new: Some, old: Some) -> Some:
-    """The tensors of ``new`` in ``rows`` (B,), those of ``old`` in the others."""
-
-    def pick(a: Tensor, b: Tensor) -> Tensor:
-        return torch.where(rows.reshape(-1, *[1] * (a.dim() - 1)), a, b)
-
-    picked = map(pick, new, old)
-    return type(new)(*picked) if hasattr(new, "_fields") else type(new)(picked)
+_STARTS = 12  # first controls that are improved where there is no linear feedback
 
 
 class BoxDDP:
@@ -194,9 +111,11 @@ class BoxDDP:
 
         Args:
             x0: (B, n).
-            control: (B, T, m), used as it is, or around ``reference``; None for the goal's linear feedback.
+            control: (B, T, m), used as it is, or around ``reference``; None for the goal's linear feedback,
+                and of a problem without one for the best of several: bounds held for a while, random ones.
             reference: states and feedback that the first control goes with; none for open loop.
-            terminal: V_T, a model a row; None for the value of the goal's linear feedback.
+            terminal: V_T, a model a row; None for that of the problem: its own, or the value of the goal's
+                linear feedback.
 
         Raises:
             ValueError: if a shape is wrong.
@@ -205,6 +124,8 @@ class BoxDDP:
         if trailing("BoxDDP.solve", "x0", x0, 2, n).dim() != 2:
             raise fail("BoxDDP.solve", "x0", f"must have the shape (B, {n})", tuple(x0.shape))
         expected = (len(x0), self.steps, m)
+        if control is None and self.problem.unregulated:
+            return self._best_of_several(x0, terminal)
         if control is None:
             gains = (-self.problem.k).expand(*expected, n)
             reference = Reference(self.problem.goals(x0, self.steps)[:, :-1], gains)
@@ -216,11 +137,10 @@ class BoxDDP:
         if reference is None:
             still = x0.unsqueeze(1).expand(-1, self.steps, -1)
             reference = Reference(still, x0.new_zeros(*expected, n))
-        if terminal is None:
-            terminal = self.ends(x0)
+        ends: End = self.ends(x0) if terminal is None else terminal
         together = max(1, _NUMBERS // (self.steps * (n + 1) * (n + m) ** 2))
         with torch.no_grad():
-            whole = x0, self.problem.admissible(control), *reference, *terminal
+            whole = x0, self.problem.admissible(control), *reference, *ends
             if len(x0) <= together:
                 return self._solve(*whole)
             parts = [
@@ -228,8 +148,31 @@ class BoxDDP:
             ]
         return Trajectories(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
-    def ends(self, x0: Tensor) -> LocalModel:
+    def _best_of_several(self, x0: Tensor, terminal: LocalModel | None) -> Trajectories:
+        """The cheapest trajectories of the cheapest first controls of each row."""
+        b, tried = len(x0), self.problem.admissible(first_controls(self.problem, self.steps))
+        with torch.no_grad():
+            ends = self.ends(x0) if terminal is None else terminal
+            still = x0.unsqueeze(1).expand(-1, self.steps, -1)
+            none = x0.new_zeros(*still.shape[:2], self.problem.inputs, x0.shape[1])
+            zero = x0.new_zeros(b, self.steps, self.problem.inputs), none, x0.new_ones(b, 1)
+            cost = torch.stack(
+                [
+                    self._followed(x0, (still, u.expand(b, -1, -1), *zero[:2]), zero[2], ends).cost
+                    for u in tried.to(x0)
+                ]
+            )
+        best = cost.argsort(dim=0, stable=True)[:_STARTS]  # (S, B)
+        count = len(best)
+        again = None if terminal is None else rows_of(terminal, torch.arange(b).repeat(count))
+        found = self.solve(x0.repeat(count, 1), tried.to(x0)[best].flatten(0, 1), None, again)
+        lowest = torch.where(torch.isfinite(found.cost), found.cost, torch.inf).view(count, b)
+        return rows_of(found, lowest.argmin(0) * b + torch.arange(b))
+
+    def ends(self, x0: Tensor) -> End:
         """V_T of plans from x0 (B, n): the value of the goal's linear feedback, or what the problem pays."""
+        if self.problem.end_value is not None:
+            return EndFunction(x0.new_zeros(len(x0)))
         none, bent = torch.zeros_like(x0), (2 * self.problem.end).expand(*x0.shape, x0.shape[-1])
         goal = self.problem.goal.expand_as(x0)
         if self.problem.path is not None:
@@ -238,14 +181,15 @@ class BoxDDP:
 
     def _solve(self, x0: Tensor, control: Tensor, *more: Tensor) -> Trajectories:
         """`solve` for as many rows as fit; ``more`` are the fields of a reference and of a terminal model."""
-        reference, terminal = Reference(*more[:2]), LocalModel(*more[2:])
+        reference = Reference(*more[:2])
+        terminal: End = LocalModel(*more[2:]) if len(more) > 3 else EndFunction(*more[2:])
         around = reference.state, control, torch.zeros_like(control), reference.feedback
         plan = self._followed(x0, around, x0.new_ones(len(x0), 1), terminal)
         going, ones = torch.isfinite(plan.cost).to(x0), torch.ones_like(plan.cost)
         begun = SearchState(*plan, FIRST * ones, ones.clone(), going)
         return self._models(self._searched(begun, terminal), terminal)
 
-    def _searched_alone(self, begun: SearchState, terminal: LocalModel) -> SearchState:
+    def _searched_alone(self, begun: SearchState, terminal: End) -> SearchState:
         """`_searched` of a program: a single row has no rows to leave out."""
 
         def iterated(now: SearchState) -> SearchState:
@@ -255,7 +199,7 @@ class BoxDDP:
         return found
 
     @traced_as(_searched_alone)
-    def _searched(self, found: SearchState, terminal: LocalModel) -> SearchState:
+    def _searched(self, found: SearchState, terminal: End) -> SearchState:
         """The state of the search after all iterations, of each the rows that go on."""
         rows = found.going.nonzero().squeeze(1)
         now, ends, known = rows_of(found, rows), rows_of(terminal, rows), None
@@ -275,7 +219,7 @@ class BoxDDP:
                     old[fresh] = fresher
         return found
 
-    def _iterated(self, now: SearchState, known: Derivatives, terminal: LocalModel) -> SearchState:
+    def _iterated(self, now: SearchState, known: Derivatives, terminal: End) -> SearchState:
         """Take one iteration: a backward pass, the best length of its change, the row's regularisation."""
         end, (change, feedback, _, bent) = self._backwards(now, known, now.mu, now.full, terminal)
         definite = end.definite > 0
@@ -291,9 +235,7 @@ class BoxDDP:
         going = torch.where(done, CONVERGED, (mu <= MOST).to(mu))
         return SearchState(*plan, mu, torch.where(better, now.full, 1 - now.full), going)
 
-    def _best_in_turn(
-        self, x0: Tensor, around: tuple[Tensor, ...], terminal: LocalModel
-    ) -> CostedTrajectories:
+    def _best_in_turn(self, x0: Tensor, around: tuple[Tensor, ...], terminal: End) -> CostedTrajectories:
         """`_best` of a program: one length after the other."""
         lengths = x0.new_tensor(LENGTHS).expand(len(x0), -1)
 
@@ -307,13 +249,13 @@ class BoxDDP:
         return self._followed(x0, around, length.unsqueeze(1), terminal)
 
     @traced_as(_best_in_turn)
-    def _best(self, x0: Tensor, around: tuple[Tensor, ...], terminal: LocalModel) -> CostedTrajectories:
+    def _best(self, x0: Tensor, around: tuple[Tensor, ...], terminal: End) -> CostedTrajectories:
         """The cheapest of five lengths of a change, side by side."""
         lengths = x0.new_tensor(LENGTHS).expand(len(x0), -1)
         return self._followed(x0, around, lengths.contiguous(), terminal)
 
     def _followed(
-        self, x0: Tensor, around: tuple[Tensor, ...], lengths: Tensor, terminal: LocalModel
+        self, x0: Tensor, around: tuple[Tensor, ...], lengths: Tensor, terminal: End
     ) -> CostedTrajectories:
         """The best of u = control + length change + feedback (x - state) within the bounds.
 
@@ -352,10 +294,10 @@ class BoxDDP:
         return Derivatives(*self._expand.over((plan.state[:, :-1], plan.control)))
 
     def _backwards(
-        self, plan: SearchState, known: Derivatives, mu: Tensor, full: Tensor, terminal: LocalModel
+        self, plan: SearchState, known: Derivatives, mu: Tensor, full: Tensor, terminal: End
     ) -> tuple[Model, tuple[Tensor, ...]]:
-        slope, bent = terminal.slope(self.problem, plan.state[:, -1]), terminal.curvature.contiguous()
-        last = Model(slope, bent, torch.zeros_like(mu), torch.ones_like(mu))
+        slope, bent = terminal.bent(self.problem, plan.state[:, -1])
+        last = Model(slope, bent.contiguous(), torch.zeros_like(mu), torch.ones_like(mu))
         reverse = tuple(part.flip(1) for part in (*known, plan.control))
         end, out = self._back(last, reverse, (mu, full))
         return end, tuple(part.flip(1) for part in out)
@@ -367,9 +309,13 @@ class BoxDDP:
         (first, second, cost_first, cost_second, control), (mu, full) = now, row
         n = self.problem.dim
         bent = (after.gradient[..., None, None] * second).sum(-3)
-        scale = cost_second[:, n:, n:].diagonal(dim1=-2, dim2=-1).abs().mean(-1)
-        firmness = (mu * scale)[:, None, None] * torch.eye(control.shape[-1], dtype=control.dtype)
         low, high = self.problem.bounds.low - control, self.problem.bounds.high - control
+        scale = cost_second[:, n:, n:].diagonal(dim1=-2, dim2=-1).abs().mean(-1)
+        if not self.problem.curved:  # a cost that is linear in u: its slope over the range of an input
+            pull = cost_first[:, n:] + (first[..., n:] * after.gradient.unsqueeze(-1)).sum(-2)
+            least, most = self.problem.reach()
+            scale = torch.where(scale > 0, scale, (pull.abs() / (most - least)).mean(-1))
+        firmness = (mu * scale)[:, None, None] * torch.eye(control.shape[-1], dtype=control.dtype)
         definite = after.definite
 
         def minimum(slope: Tensor, cross: Tensor, hessian: Tensor) -> tuple[Tensor, Tensor]:
@@ -384,7 +330,7 @@ class BoxDDP:
         model = Model(gradient, curvature, after.promised + promised, definite)
         return model, (change, feedback, gradient, curvature)
 
-    def _models(self, plan: SearchState, terminal: LocalModel) -> Trajectories:
+    def _models(self, plan: SearchState, terminal: End) -> Trajectories:
         """The local models along finished trajectories, with as little regularisation as they bear."""
         known, small = self._derivatives(plan), torch.full_like(plan.cost, LEAST)
 
@@ -396,14 +342,14 @@ class BoxDDP:
         *parts, fine = scan(models, (), both)[1]  # the second model is that of Gauss and Newton
         exact, gauss = zip(*(part.unbind(1) for part in parts), strict=True)
         feedback, gradient, curvature = chosen(fine[:, 0], exact, gauss)
-        last = terminal.slope(self.problem, plan.state[:, -1])
+        last, bent = terminal.bent(self.problem, plan.state[:, -1])
         return Trajectories(
             plan.state,
             plan.control,
             feedback,
             plan.paid.flip(1).cumsum(1).flip(1),
             torch.cat((gradient, last.unsqueeze(1)), dim=1),
-            torch.cat((curvature, terminal.curvature.unsqueeze(1)), dim=1),
+            torch.cat((curvature, bent.unsqueeze(1)), dim=1),
             (plan.going == CONVERGED) & torch.isfinite(plan.cost),
         )
 

@@ -11,13 +11,23 @@ from torch import Tensor, nn
 
 from ...lanes import Program, scan
 from ...numerics.checks import fail, integer, positive_real, trailing, vector
+from ..problem.rules import check_endless, check_regulator
 from ..problem.sampled import SampledProblem
-from .ddp import LocalModel, Reference, Trajectories, around, packed, resting, unpacked
+from .trajectories import LocalModel, Reference, Trajectories, around, packed, resting, unpacked
 
 _TOGETHER = 4096  # candidates rolled out at once
 _ROUND = 0.01  # share of the metric that counts every coordinate, also one of which no cost depends
 _REACH = 0.3  # of the region: a rollout that ends further from what it follows has lost it
 _ARRIVED = 0.01  # share of a trajectory's cost that may be the terminal value: else it did not reach the goal
+
+
+def check_memorable(call: str, problem: SampledProblem) -> None:
+    """Refuse a problem without a goal at which trajectories arrive and stay."""
+    if problem.path is not None:
+        raise fail(call, "problem", "must have a goal that stays where it is", problem.path)
+    check_regulator(call, "problem", problem.unregulated)
+    end = None if problem.endless else problem.end
+    check_endless(call, "problem", end, "a memory knows no end")
 
 
 class Choice(NamedTuple):
@@ -86,12 +96,7 @@ class GlobalValue(nn.Module):
         spacing: float = 0.02,
     ) -> None:
         super().__init__()
-        if problem.path is not None:
-            raise fail("GlobalValue", "problem", "must have a goal that stays where it is", problem.path)
-        if not problem.endless:
-            raise fail(
-                "GlobalValue", "problem", "must have no terminal cost: a memory knows no end", problem.end
-            )
+        check_memorable("GlobalValue", problem)
         self.problem, self.library = problem, library
         width = region.tolist() if isinstance(region, Tensor) else list(region)
         if min(vector("GlobalValue", "region", width, problem.dim)) <= 0:

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from ...numerics.checks import fail, integer, real
 from ..problem.sampled import SampledProblem
-from .ddp import BoxDDP, Reference, Trajectories, chosen, rows_of
-from .global_value import GlobalValue
+from .ddp import BoxDDP
+from .global_value import GlobalValue, check_memorable
+from .trajectories import Reference, Trajectories, chosen, rows_of
 
 _log = logging.getLogger(__name__)
 _HELD = 10  # steps for which a random first control is held
@@ -81,6 +82,7 @@ def learn_global_value(
     """
     if not 0 < real("learn_global_value", "enough", enough) <= 1:
         raise fail("learn_global_value", "enough", "must be in (0, 1]", enough)
+    check_memorable("learn_global_value", problem)
     integer("learn_global_value", "trajectories", trajectories, least=2)
     integer("learn_global_value", "rounds", rounds, least=0)
     integer("learn_global_value", "states", states, least=1)

@@ -14,7 +14,8 @@ from ...numerics.checks import choice, fail, integer, positive_real
 from ...systems import Plant
 from ..problem.cost import Matrix, QuadraticCost
 from ..problem.sampled import SampledProblem
-from .ddp import BoxDDP, Reference, Trajectories, chosen, rows_of
+from .ddp import BoxDDP
+from .trajectories import Reference, Trajectories, chosen, rows_of
 
 Obstacle = Callable[[Tensor], Tensor]
 """h(x), at least 0 outside: (..., n) -> (...)."""

@@ -15,11 +15,21 @@ from ...numerics.checks import fail, flag, integer
 from ..loop.controller import Controller
 from ..policies.sampled_rollout import SampledRollout
 from ..problem.sampled import SampledProblem
-from .ddp import BoxDDP, LocalModel, Reference, Trajectories, around, packed, resting, rows_of, unpacked
+from .ddp import BoxDDP
 from .global_value import GlobalValue
 from .global_value_learning import best_from
+from .trajectories import (
+    LocalModel,
+    Reference,
+    Trajectories,
+    around,
+    held_controls,
+    packed,
+    resting,
+    rows_of,
+    unpacked,
+)
 
-_LENGTHS = (2, 4, 7, 12, 20, 30)  # periods for which a corner of the bounds is held before the feedback
 _ITERATIONS = 15  # of `BoxDDP`, for a plan that is made anew at every control
 
 
@@ -194,7 +204,9 @@ def _following(found: Trajectories) -> Following:
 def best_held(search: BoxDDP, x: Tensor) -> Trajectories:
     """The cheapest trajectories from x (B, n) that a search reaches from the linear feedback of the goal, and
     from each corner of the bounds, held for 2 to 30 periods before it."""
-    control, feedback = _guesses(search.problem, search.steps)
+    if search.problem.unregulated:  # which has several of its own
+        return search.solve(x)
+    control, feedback = held_controls(search.problem, search.steps)
     count, b = len(control), len(x)
     goal = search.problem.goals(x, search.steps)[:, :-1]
     found = search.solve(
@@ -204,18 +216,6 @@ def best_held(search: BoxDDP, x: Tensor) -> Trajectories:
     )
     cost = torch.where(torch.isfinite(found.cost), found.cost, torch.inf).view(count, b)
     return rows_of(found, cost.argmin(0) * b + torch.arange(b))
-
-
-def _guesses(problem: SampledProblem, steps: int) -> tuple[Tensor, Tensor]:
-    """First controls (G, T, m), and their feedback (G, T, m, n); the linear feedback first."""
-    levels = problem.levels()
-    corners = levels[(levels != problem.rest).all(-1)]
-    held = [(length, u) for length in _LENGTHS if length < steps for u in corners]
-    control = problem.rest.repeat(1 + len(held), steps, 1)
-    feedback = (-problem.k).repeat(1 + len(held), steps, 1, 1)
-    for k, (length, u) in enumerate(held, 1):
-        control[k, :length], feedback[k, :length] = u, 0.0
-    return control, feedback
 
 
 class BoundedPlans:

@@ -135,7 +135,7 @@ class RolloutPolicy(nn.Module):
         if kernel is None:
             kernel = GaussianKernel() if isinstance(system, Barrier) else ExponentialKernel()
         basis = StaFBasis(kernel, StateFollowingCenters(directions, radius))
-        end = lqr.value if cost.end is None else lqr.cost.terminal
+        end = lqr.value if cost.ending is None else lqr.cost.terminal
         return cls(basis, system, cost, lqr, end, horizon=horizon, steps=steps, depth=depth, period=period)
 
     @compiled(_NAME, by=lambda policy: _TwoPrograms(policy))

@@ -15,11 +15,13 @@ from ...numerics.checks import copied, fail, non_negative, one_or_each, positive
 from ...numerics.linalg import positive_definite, positive_semidefinite
 from ...systems import Bounds, Plant
 from ...systems.bounds import Limit
-from ...systems.equilibria import check_rest, resting_input_at
+from ...systems.equilibria import resting_input_at
 
 _EDGE = 1 - 1e-9  # of the bound, beyond which artanh is that of this share
 
 Matrix = float | Sequence[float] | Sequence[Sequence[float]] | Tensor
+EndValue = Callable[[Tensor], Tensor]
+"""V_T from x: (..., n) -> (...)."""
 Output = Callable[[Tensor], Tensor]
 """y from x: (..., n) -> (..., p)."""
 
@@ -46,8 +48,9 @@ class Cost(nn.Module, abc.ABC):
         output: y(x), (..., n) -> (..., p), in place of x: e = y(x) - y(target), and Q is (p, p) or a matrix.
             x is turned to within pi of the target before; what turns with it is an angle itself.
         discount: rho in 1/s: what is paid at t counts exp(-rho t).
-        terminal: S of e'Se, (n, n) or a number, paid where plans, shooting and rollouts end, in place of the
-            LQR's value; None for an endless horizon, which all else is for. Not with an output or a discount.
+        terminal: paid where plans, shooting and rollouts end, in place of the LQR's value: V_T, (..., n) ->
+            (...) with two derivatives, or S of e'Se, (n, n), its diagonal or a number, 0 allowed. None for an
+            endless horizon, which all else is for. Not with a discount, S not with an output.
 
     Raises:
         ValueError: if Q is not positive semidefinite or R not positive definite of its size, or another
@@ -67,16 +70,16 @@ class Cost(nn.Module, abc.ABC):
         target_input: Sequence[float] | Tensor | None = None,
         output: Output | None = None,
         discount: float = 0.0,
-        terminal: Matrix | None = None,
+        terminal: Matrix | EndValue | None = None,
     ) -> None:
         super().__init__()
         name = type(self).__name__
         self.dim, self.inputs, self.output = dim, inputs, output
         self.target = _point(name, "target", target, dim)
         seen = dim if output is None else _outputs(name, output, dim)
-        q = positive_semidefinite(name, "state", _square(name, "state", state, seen), seen)
+        q = positive_semidefinite(name, "state", square(name, "state", state, seen), seen)
         self.register_buffer("q", q)
-        r = positive_definite(name, "control", _square(name, "control", control, inputs), inputs)
+        r = positive_definite(name, "control", square(name, "control", control, inputs), inputs)
         self.register_buffer("r", r)
         self.register_buffer("r_inverse", torch.linalg.inv(r))
         self.q: Tensor
@@ -85,13 +88,14 @@ class Cost(nn.Module, abc.ABC):
         self.target_input = _point(name, "target_input", target_input, inputs)
         non_negative(name, "discount", discount)
         self.discount = real(name, "discount", discount)
-        if terminal is not None and (output is not None or self.discount):
+        if terminal is not None and (self.discount or (output is not None and not callable(terminal))):
             raise fail(name, "terminal", "must be None beside an output or a discount", terminal)
-        end = None if terminal is None else _square(name, "terminal", terminal, dim)
+        self.end_value = terminal if callable(terminal) else None
+        end = None if terminal is None or callable(terminal) else square(name, "terminal", terminal, dim)
         self.register_buffer(
             "end", None if end is None else positive_semidefinite(name, "terminal", end, dim)
         )
-        self.end: Tensor | None
+        self.end: Tensor | None  # S
         self.periodic: tuple[int, ...] = ()
         self._periods: tuple[float, ...] = ()  # of the outputs
         bounds = Bounds(low, high, inputs)
@@ -102,8 +106,11 @@ class Cost(nn.Module, abc.ABC):
         """This cost with a plant's equilibrium, periodic coordinates and bounds where it states none of its
         own; itself where there is nothing to add.
 
+        The plant need not rest at the set-point: whoever regulates asks `problem.rules` for that. Where no
+        input holds it there, effort is measured from the one that comes nearest to it.
+
         Raises:
-            ValueError: if the sizes differ, or the plant does not rest at the set-point within the bounds.
+            ValueError: if the sizes differ.
         """
         name = type(plant).__name__
         if (plant.dim or self.dim) != self.dim or plant.inputs not in (0, self.inputs):
@@ -117,9 +124,10 @@ class Cost(nn.Module, abc.ABC):
         else:
             x = self.target
             u = resting_input_at(plant, x) if self.target_input is None else self.target_input
-        check_rest(plant, x, u)
+        u = u if bool(torch.isfinite(u).all()) else plant.resting_input()
         placed = copied(self)
-        placed.target = x if bool((x != 0).any()) else None
+        # An origin that the plant does not take by itself is kept: `around` may be asked again.
+        placed.target = x if bool((x != 0).any() or (plant.equilibrium() != 0).any()) else None
         placed.target_input = u if bool((u != 0).any()) else None
         placed.periodic = plant.periodic
         if self.output is not None and self.periodic != plant.periodic:
@@ -176,8 +184,15 @@ class Cost(nn.Module, abc.ABC):
         target = y.new_zeros(self.dim) if self.target is None else self.target.to(y)
         return wrap_each(y - self.output(target), self._periods)
 
+    @property
+    def ending(self) -> Tensor | EndValue | None:
+        """The terminal cost as it was given: S or V_T; None for an endless horizon."""
+        return self.end if self.end_value is None else self.end_value
+
     def terminal(self, x: Tensor) -> Tensor:
-        """e'Se, of a cost with a terminal cost: (..., n) -> (...)."""
+        """e'Se or V_T, of a cost with a terminal cost: (..., n) -> (...)."""
+        if self.end_value is not None:
+            return self.end_value(x)
         assert self.end is not None
         return quadratic(self.end, self.deviation(x))
 
@@ -385,14 +400,16 @@ def _pull(effectiveness: Tensor, gradient: Tensor) -> Tensor:
     return (effectiveness * gradient.unsqueeze(-1)).sum(-2)
 
 
-def _square(call: str, name: str, value: Matrix, size: int) -> Tensor:
+def square(call: str, name: str, value: Matrix, size: int) -> Tensor:
+    """A matrix given as itself, by its diagonal, or as a number times the identity: (size, size)."""
     if isinstance(value, Tensor):
         return value.to(torch.float64) if value.dim() != 1 else value.to(torch.float64).diag()
     if isinstance(value, Sequence) and not isinstance(value, str):
         if value and all(isinstance(entry, int | float) for entry in value):
             return torch.tensor(vector(call, name, value, len(value)), dtype=torch.float64).diag()
         return torch.tensor([vector(call, name, row, len(value)) for row in value], dtype=torch.float64)
-    return positive_real(call, name, value) * torch.eye(size, dtype=torch.float64)
+    number = real if name == "terminal" else positive_real  # nothing may be paid at the end
+    return number(call, name, value) * torch.eye(size, dtype=torch.float64)
 
 
 def _point(call: str, name: str, value: Sequence[float] | Tensor | None, size: int) -> Tensor | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
@@ -13,18 +14,20 @@ from torch.nn.functional import pad
 
 from ...lanes import each, traced_as
 from ...numerics.angles import turned, unwrapped, wrap
-from ...numerics.checks import fail, integer, positive_real, trailing
+from ...numerics.checks import fail, integer, trailing
 from ...numerics.forward_mode import use_forward_mode
-from ...numerics.linalg import discrete_riccati, positive_semidefinite
+from ...numerics.linalg import discrete_riccati, positive_semidefinite, unstabilisable_mode
 from ...numerics.runge_kutta import runge_kutta_mean, runge_kutta_stages
 from ...systems import Bounds, Plant
 from ...systems.bounds import Limit
-from .cost import Cost
+from .cost import Cost, EndValue, Matrix, square
 from .held_plant import Holding
+from .rules import check_torch, check_undiscounted, check_within, own_period
 from .tracking_cost import Path, TrackingCost
 
 StepFunction = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 """(x (B, n), u (B, m)) -> (x+ (B, n), cost of the step (B,))."""
+_log = logging.getLogger(__name__)
 _RESTS = 1e-6  # of the scale of the state: how far the goal may move in a step
 
 
@@ -49,20 +52,24 @@ class SampledProblem(nn.Module):
         low: of u, as in `systems.Bounds`; None for none.
         high: likewise.
         periodic: the coordinates that are angles, in rad.
-        goal: state at which the plant rests at no cost, (n,); the origin by default.
+        goal: state that distances are measured from, (n,); the origin by default. Where the plant rests
+            there at no cost the problem has a linear regulator; it need not.
         rest: control that keeps it there, (m,); 0 by default.
         path: x_d from t, (...) -> (..., n - 1), for a problem whose last coordinate is the time: the goal
             moves along it. The linear feedback is that of ``goal``, where the plant rests, carried along.
-        terminal: S of d'Sd, paid where a plan ends, (n, n) positive semidefinite, d = x - goal; None for P
-            below, as the problem goes on without an end.
+        terminal: what is paid where a plan ends: V_T, (B, n) -> (B,) with two derivatives, or S of d'Sd,
+            (n, n) positive semidefinite, d = x - goal, a number s for s I; None for P below, as the problem
+            goes on without an end.
 
     Attributes:
         p: P of the value d'Pd of the best linear feedback near the goal, (n, n), d = x - goal.
         k: K of its control rest - K d, (m, n).
+        unregulated: why there is no such feedback: the plant does not rest at the goal at no cost within the
+            bounds, or its linearisation cannot be stabilised. P and K are 0 then, and without ``terminal``
+            the end of a plan costs nothing, with a warning in the log. "" where there is one.
 
     Raises:
-        ValueError: if an argument breaks its rule, ``step`` returns other shapes, the goal is not at rest at
-            no cost, or the linearisation there cannot be stabilised.
+        ValueError: if an argument breaks its rule or ``step`` returns other shapes.
     """
 
     def __init__(
@@ -77,7 +84,7 @@ class SampledProblem(nn.Module):
         goal: Tensor | None = None,
         rest: Tensor | None = None,
         path: Path | None = None,
-        terminal: Tensor | None = None,
+        terminal: Tensor | float | EndValue | None = None,
     ) -> None:
         super().__init__()
         self.step = step
@@ -92,24 +99,33 @@ class SampledProblem(nn.Module):
         self.register_buffer("rest", none if rest is None else rest.double())
         self.goal: Tensor
         self.rest: Tensor
-        if not bool(((self.bounds.low < self.rest) & (self.rest < self.bounds.high)).all()):
-            rule = f"must lie between the bounds, {self.bounds.low.tolist()} and {self.bounds.high.tolist()}"
-            raise fail("SampledProblem", "rest", rule, self.rest.tolist())
         if not set(periodic) <= set(range(-self.dim, self.dim)):
             raise fail("SampledProblem", "periodic", f"must be coordinates of {self.dim}", list(periodic))
         self.periodic = tuple(sorted({index % self.dim for index in periodic}))
         self.tick = 0.0  # s of a step, where the last coordinate is the time
-        self._check()
-        p, k = self._regulator()
+        moved, paid = self._check()
+        self.unregulated, p, k = "", none.new_zeros(self.dim, self.dim), none.new_zeros(inputs, self.dim)
+        self.curved = False  # whether the cost bends in every input at the goal
+        try:
+            at = self._linearised()
+            self._check_rest(moved, paid)
+            p, k = self._regulator(at)
+        except ValueError as error:
+            self.unregulated = str(error)
         self.register_buffer("p", p)
         self.register_buffer("k", k)
         self.p: Tensor
         self.k: Tensor
         self.endless = terminal is None
-        if terminal is not None:
-            terminal = positive_semidefinite("SampledProblem", "terminal", terminal, self.dim)
-        self.register_buffer("end", p if terminal is None else terminal)
+        self.end_value = terminal if callable(terminal) else None
+        self.register_buffer("end", self._end(terminal))
         self.end: Tensor
+        if self.unregulated and self.endless:
+            _log.warning(
+                "`SampledProblem` has no linear regulator at the goal (%s): the end of a plan costs nothing. "
+                "Give `terminal`, V_T of x or S of d'Sd, or a horizon after which nothing counts.",
+                self.unregulated,
+            )
 
     @classmethod
     def of(
@@ -121,6 +137,7 @@ class SampledProblem(nn.Module):
         low: Limit = None,
         high: Limit = None,
         substeps: int | None = None,
+        terminal: Matrix | EndValue | None = None,
     ) -> SampledProblem:
         """A plant and a cost rate, with the control held for dt.
 
@@ -135,21 +152,15 @@ class SampledProblem(nn.Module):
             low: of the inputs; None for those of the cost, or else of the plant.
             high: likewise.
             substeps: Runge-Kutta steps a period; None for as many as are accurate. Fewer are a warning.
+            terminal: as in `SampledProblem`; None for that of the cost, or else P.
 
         Raises:
             ValueError: if an argument breaks its rule, or as in `SampledProblem`.
         """
-        if not plant.traceable:
-            rule = (
-                "must be written in torch all through: trajectories are optimised by its second derivatives"
-            )
-            raise fail("SampledProblem.of", "plant", rule, plant)
+        check_torch("SampledProblem.of", "plant", plant)
         cost = cost.bounded(low, high).around(plant)
-        if cost.discount:
-            raise fail("SampledProblem.of", "cost", "must have no discount", cost.discount)
-        h = positive_real("SampledProblem.of", "dt", dt) if plant.period is None else plant.period
-        if plant.period is not None and dt is not None and dt != plant.period:
-            raise fail("SampledProblem.of", "dt", f"must be the plant's period, {plant.period} s", dt)
+        check_undiscounted("SampledProblem.of", cost)
+        h = own_period("SampledProblem.of", plant, dt)
 
         box = cost.bounds
         holding: Holding | None = None
@@ -167,7 +178,7 @@ class SampledProblem(nn.Module):
             goal=plant.equilibrium() if isinstance(cost, TrackingCost) else cost.target,
             rest=cost.target_input,
             path=cost.path if isinstance(cost, TrackingCost) else None,
-            terminal=cost.end,
+            terminal=cost.ending if terminal is None else terminal,
         )
         problem.holding = holding
         return problem
@@ -198,7 +209,9 @@ class SampledProblem(nn.Module):
         return self.offset(x, torch.cat((self.path(x[..., -1]), x[..., -1:]), dim=-1))
 
     def terminal(self, x: Tensor) -> Tensor:
-        """Return the cost at the end of a plan: d'Pd of the linear feedback, or d'Sd: (..., n) -> (...)."""
+        """Cost at the end of a plan, d'Pd of the linear feedback, d'Sd or V_T: (..., n) -> (...)."""
+        if self.end_value is not None:
+            return self.end_value(x.reshape(-1, self.dim)).reshape(x.shape[:-1])
         d = self.away(x)
         return ((d.unsqueeze(-2) * self.end).sum(-1) * d).sum(-1)
 
@@ -222,6 +235,12 @@ class SampledProblem(nn.Module):
         ]
         return torch.cartesian_prod(*columns).reshape(-1, self.inputs)
 
+    def reach(self) -> tuple[Tensor, Tensor]:
+        """The bounds, where there are none a unit of the input beside its rest: (m,), (m,)."""
+        low, high, rest = self.bounds.low, self.bounds.high, self.admissible(self.rest)
+        below, above = torch.minimum(rest, high) - 1.0, torch.maximum(rest, low) + 1.0
+        return torch.where(torch.isfinite(low), low, below), torch.where(torch.isfinite(high), high, above)
+
     def derivatives(self, x: Tensor, u: Tensor) -> Derivatives:
         """First and second derivatives of F and l with respect to z = (x, u): (B, n), (B, m).
 
@@ -237,7 +256,34 @@ class SampledProblem(nn.Module):
         first, second = _slopes_and_bends(both, z, n + 1)
         return Derivatives(first[:, :n], second[:, :n], first[:, n], second[:, n])
 
-    def _check(self) -> None:
+    def end_model(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Slope and curvature of V_T at x (B, n), where it is a function: (B, n), (B, n, n)."""
+        value = self.end_value
+        assert value is not None
+
+        def one(y: Tensor) -> Tensor:
+            return value(y.reshape(-1, self.dim)).reshape(*y.shape[:-1], 1)
+
+        first, second = _slopes_and_bends(one, x, 1)
+        return first[:, 0], second[:, 0]
+
+    def _end(self, terminal: Tensor | float | EndValue | None) -> Tensor:
+        """S of the terminal cost, (n, n), checked; 0 where that is a function."""
+        if terminal is None:
+            return self.p.clone()
+        if callable(terminal):
+            value = terminal(self.goal.expand(2, -1))
+            if not isinstance(value, Tensor) or value.shape != (2,):
+                got = tuple(value.shape) if isinstance(value, Tensor) else value
+                raise fail("SampledProblem", "terminal", f"must map x (2, {self.dim}) to values (2,)", got)
+            return torch.zeros_like(self.p)
+        return positive_semidefinite(
+            "SampledProblem", "terminal", square("SampledProblem", "terminal", terminal, self.dim), self.dim
+        )
+
+    @torch.no_grad()
+    def _check(self) -> tuple[float, float]:
+        """Check the shapes, and return how far the goal moves in a step, and at what cost."""
         x, u = self.goal.expand(2, -1), self.rest.expand(2, -1)
         trailing("SampledProblem", "goal", self.goal, 1, self.dim)
         after, paid = self.step(x, u)
@@ -251,26 +297,44 @@ class SampledProblem(nn.Module):
             self.tick = float(after[0, -1] - x[0, -1])
             if not self.tick > 0:
                 raise fail("SampledProblem", "step", "must move the time, the last coordinate", self.tick)
-            return
-        moved = float(self.offset(after, x).abs().max())
-        if moved > _RESTS * (1 + float(x.abs().max())) or abs(float(paid[0])) > _RESTS:
+            return 0.0, 0.0
+        return float(self.offset(after, x).abs().max()), float(paid[0])
+
+    def _check_rest(self, moved: float, paid: float) -> None:
+        """Refuse a goal without a regulator: one that moves, costs something, or is held out of bounds."""
+        if not moved <= _RESTS * (1 + float(self.goal.abs().max())) or not abs(paid) <= _RESTS:
             raise ValueError(
-                f"`SampledProblem(goal=...)` must be a state of rest at no cost; within one step it moves by "
-                f"{moved:.3g} and costs {float(paid[0]):.3g}."
+                f"the goal is no state of rest at no cost: within one step it moves by {moved:.3g} and costs "
+                f"{paid:.3g}"
             )
 
-    def _regulator(self) -> tuple[Tensor, Tensor]:
+    @torch.no_grad()
+    def _linearised(self) -> Derivatives:
+        """Derivatives at the goal, of a network's values as they are now."""
+        try:
+            at = self.derivatives(self.goal.unsqueeze(0), self.rest.unsqueeze(0))
+        except (RuntimeError, TypeError) as error:
+            raise ValueError(f"`step` cannot be differentiated there: {error}") from error
+        self.curved = bool((at.cost_second[0].diagonal()[self.dim :] > 0).all())
+        return at
+
+    def _regulator(self, at: Derivatives) -> tuple[Tensor, Tensor]:
         """P and K of the linear-quadratic problem at the goal."""
-        at = self.derivatives(self.goal.unsqueeze(0), self.rest.unsqueeze(0))
         m, n = self.inputs, self.dim - (self.path is not None)
         kept = [*range(n), *range(self.dim, self.dim + m)]  # without the time
-        paid = 0.5 * at.cost_second[0][kept][:, kept]
+        slope, paid = at.cost_first[0][kept], 0.5 * at.cost_second[0][kept][:, kept]
+        if self.path is None and float(slope.abs().max()) > _RESTS * (1 + float(paid.abs().max())):
+            raise ValueError(f"its cost has a slope there, {slope.tolist()}: it is no least")
+        check_within("SampledProblem", "rest", self.bounds, self.rest)
+        a, b = at.first[0, :n, :n], at.first[0, :n, -m:]
+        mode = unstabilisable_mode(a, b, discrete=True)
+        if mode is not None:
+            raise ValueError(f"no input reaches the mode of its linearisation with the eigenvalue {mode:.6g}")
         try:
-            p, k = discrete_riccati(at.first[0, :n, :n], at.first[0, :n, -m:], paid)
+            p, k = discrete_riccati(a, b, paid)
         except (np.linalg.LinAlgError, ValueError) as error:
             raise ValueError(
-                "`SampledProblem(step=...)` has no linear-quadratic regulator at the goal: its linearisation "
-                f"cannot be stabilised, or its cost is not convex there ({error})."
+                f"its linearisation cannot be stabilised, or its cost is not convex there ({error})"
             ) from error
         clock = self.dim - n
         return pad(p, (0, clock, 0, clock)), pad(k, (0, clock))

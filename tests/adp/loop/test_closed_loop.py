@@ -340,12 +340,19 @@ class Pushed(systems.TwoState):
         ({"x0": torch.zeros(0, 2).double()}, r"must have the shape \(B, n\); got \(0, 2\)"),
         ({"plant": Misshapen(drift=lambda x: None)}, r"`Misshapen.drift` must map \(3, 2\) .*; got None"),
         ({"plant": Misshapen(effectiveness=lambda x: x)}, r"`Misshapen.effectiveness` .* to \(3, 2, 1\)"),
-        ({"plant": Pushed()}, r"`Pushed.drift` must be 0 at the origin"),
     ],
 )
 def test_arguments_of_a_run_are_refused_by_name(given: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         run(**given)
+
+
+def test_a_plant_that_nothing_holds_at_the_set_point_runs_and_the_log_says_so(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    with caplog.at_level("WARNING"):
+        run(plant=Pushed())
+    assert "nothing holds the plant at the set-point: `Pushed.drift` must be 0 at the origin" in caplog.text
 
 
 # --- controllers of a user ----------------------------------------------------------------------------------

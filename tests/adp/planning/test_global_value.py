@@ -15,8 +15,8 @@ from helpers_swingup import GRID, REGION, RESETS, double_integrator
 from torch import Tensor
 
 from staf_torch import adp, deploy
-from staf_torch.adp.planning.ddp import Trajectories, rows_of
 from staf_torch.adp.planning.global_value_learning import best_from, swept
+from staf_torch.adp.planning.trajectories import Trajectories, rows_of
 
 
 def swing(policy: adp.GlobalValue, x: Tensor) -> tuple[Tensor, Tensor]:

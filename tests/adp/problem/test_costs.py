@@ -202,9 +202,9 @@ def test_the_input_of_a_set_point_is_stated_or_found() -> None:
     stated = adp.QuadraticCost(Q, R, 2, 2, target=[2.0, -3.0], target_input=[3.0, 2.0]).around(plant)
     torch.testing.assert_close(stated.target_input, tensor([3.0, 2.0]))
     with pytest.raises(ValueError, match="does not rest"):
-        adp.QuadraticCost(Q, R, 2, 2, target=[2.0, -3.0], target_input=[3.0, 1.0]).around(plant)
+        adp.LQR(plant, adp.QuadraticCost(Q, R, 2, 2, target=[2.0, -3.0], target_input=[3.0, 1.0]))
     with pytest.raises(ValueError, match="does not rest"):
-        adp.QuadraticCost(Q, R, 2, 2, target_input=[0.5, 0.0]).around(plant)
+        adp.LQR(plant, adp.QuadraticCost(Q, R, 2, 2, target_input=[0.5, 0.0]))
 
 
 def test_bounds_are_replaced_in_a_copy_that_is_prepared_anew() -> None:

@@ -118,7 +118,7 @@ def swinging(**given: Any) -> systems.StepPlant:
 
 
 @pytest.mark.parametrize(
-    ("periodic", "bounds", "target"), [((), (None, None), None), ((0,), (-0.7, 0.4), [0.6, 0.0])]
+    ("periodic", "bounds", "target"), [((), (None, None), None), ((0,), (-1.3, -0.2), [0.6, 0.0])]
 )
 @pytest.mark.parametrize("base", ["lqr", "smooth", "function"])
 def test_a_feedback_is_followed_as_it_is_asked(base: str, target: Any, bounds: Any, periodic: Any) -> None:

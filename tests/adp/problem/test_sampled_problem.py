@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -13,7 +14,7 @@ from helpers_swingup import double_integrator
 from torch import Tensor
 
 from staf_torch import adp, lanes, systems
-from staf_torch.adp.planning.ddp import LocalModel
+from staf_torch.adp.planning.trajectories import LocalModel
 from staf_torch.numerics.forward_mode import use_forward_mode
 
 INF = math.inf
@@ -92,13 +93,35 @@ def test_a_goal_may_move_by_a_millionth_of_its_size_and_cost_a_millionth(
     def make() -> adp.SampledProblem:
         return adp.SampledProblem(step, dim=1, inputs=1, goal=tensor([3.0]))
 
-    if refused:
-        with pytest.raises(
-            ValueError, match="must be a state of rest at no cost; within one step it moves by"
-        ):
-            make()
-    else:
-        assert make().goal.tolist() == [3.0]
+    said = "the goal is no state of rest at no cost: within one step it moves by"
+    assert make().unregulated.startswith(said) == refused
+    assert bool(make().k.any()) != refused
+
+
+@pytest.mark.parametrize(
+    ("step", "given", "said"),
+    [
+        (lambda x, u: (x + 1, u[:, 0] ** 2), {}, "within one step it moves by 1 and costs 0"),
+        (lambda x, u: (2 * x, u[:, 0] ** 2 + x[:, 0] ** 2), {}, "no input reaches .* the eigenvalue 2"),
+        (lambda x, u: (x + u, u[:, 0] ** 2 - x[:, 0]), {}, r"its cost has a slope there, \[-1.0, 0.0\]"),
+        (lambda x, u: (x + u.abs(), (x**2 + u**2)[:, 0]), {}, "no input reaches"),
+        (lambda x, u: (x + u - 2, (x + u - 2)[:, 0] ** 2), {"rest": tensor([2.0]), "high": 1.0}, "bounds"),
+    ],
+)  # fmt: skip
+def test_a_problem_without_a_regulator_says_why_and_ends_at_no_cost(
+    step: Any, given: dict[str, Any], said: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level("WARNING"):
+        made = adp.SampledProblem(step, dim=1, inputs=1, **given)
+    assert re.search(said, made.unregulated)
+    assert "Give `terminal`" in caplog.text
+    assert not torch.cat((made.p, made.k)).any()
+    assert not made.terminal(tensor([[3.0]])).any()
+    caplog.clear()
+    with caplog.at_level("WARNING"):
+        ended = adp.SampledProblem(step, dim=1, inputs=1, terminal=2.0, **given)
+    assert caplog.text == ""
+    assert float(ended.terminal(tensor([[3.0]]))) == 18.0
 
 
 def test_a_step_of_either_wrong_shape_is_refused() -> None:
@@ -119,8 +142,6 @@ def test_arguments_of_a_problem_break_their_rule_by_name() -> None:
     for given, message in (
         ({"periodic": [2]}, r"periodic=...\)` must be coordinates of 2; got \[2\]"),
         ({"periodic": [-3]}, r"periodic=...\)` must be coordinates of 2"),
-        ({"rest": tensor([0.0, 1.0]), "high": 1.0}, r"rest=...\)` must lie between the bounds"),
-        ({"rest": tensor([0.0, -1.0]), "low": -1.0}, r"rest=...\)` must lie between the bounds"),
         ({"goal": tensor([0.0])}, r"goal=...\)` must have 2 entries"),
         ({"dim": 0}, r"dim=...\)` must be at least 1"),
         ({"inputs": 0}, r"inputs=...\)` must be at least 1"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Sequence
 
@@ -9,15 +10,25 @@ import torch
 from torch import Tensor
 
 from ....numerics.checks import fail, integer, positive_real, trailing
-from ....systems import Clocked, ControlAffineSystem, Linear, Plant
+from ....numerics.linalg import positive_semidefinite
+from ....systems import ControlAffineSystem, Linear, Plant
 from ....systems.bounds import Limit
 from ...loop.controller import LQR, Policy, Value
-from ...problem.cost import Cost
-from ..ddp import chosen
+from ...problem.cost import Cost, Matrix, quadratic, square
+from ...problem.rules import (
+    check_regulates,
+    check_still,
+    check_torch,
+    check_undiscounted,
+    restless,
+    set_point,
+)
+from ..trajectories import chosen
 from .newton import Interval, MeshPlan, NewtonSolution, follow, minimise, replay
 from .optimum import Optimum
 from .starts import guesses, guided
 
+_log = logging.getLogger(__name__)
 _DECAY = 9.2  # time constants of the slowest mode in the horizon: it falls to 1e-4
 _RESOLVED = 0.5  # mean interval in time constants of the fastest mode
 _LEAST = 80  # intervals
@@ -33,6 +44,7 @@ _GRADING = 6.0  # ratio of a mesh's last interval to the first
 _DOUBLINGS = 3  # of the horizon
 _SPLINES = 8  # random guesses
 _ROUNDED = 4.0  # rounding units of the state, within which it is at the set-point
+_NOTHING = 1e-12  # terminal cost of a set-point at which the optimum is to stay
 
 
 class DirectShooting:
@@ -71,21 +83,24 @@ class DirectShooting:
     Args:
         system: the plant, in continuous time and in torch; its rate must have second derivatives.
         cost: the cost rate, without a discount.
-        base: the policy to start from, (..., n) -> (..., m), or several; the LQR by default.
-        terminal: V_T, (..., n) -> (...), with two derivatives; by default the cost's own terminal
-            cost, or else the Riccati value.
+        base: the policy to start from, (..., n) -> (..., m), or several; the LQR by default, and where there
+            is none the input of the set-point.
+        terminal: V_T, (..., n) -> (...), with two derivatives, or S of e'Se, (n, n), its diagonal or a
+            number; by default the cost's own terminal cost, or else the Riccati value, and where there is
+            none nothing, with a warning in the log.
         low: of the inputs, as in `systems.Bounds`; by default those of the cost, or else of the plant.
         high: likewise.
         horizon: T in s; by default so long that the slowest mode of the LQR has fallen to 1e-4, and twice to
-            eight times that where the terminal cost is more than 1e-3 of a value.
-        intervals: N, even; by default so many that the fastest mode of the LQR is resolved.
+            eight times that where the terminal cost is more than 1e-3 of a value. With a horizon a plant
+            needs no LQR, and a cost may be an economic one, with no set-point at all.
+        intervals: N, even; by default so many that the fastest mode of the LQR is resolved, 80 without one.
         tolerance: positive, relative.
         iterations: at most, on each mesh; by default 50, or 120 where inputs are bounded.
         starts: guesses that are improved in a row that needs more than the base, at least 1.
         seed: of the random guesses.
 
     Raises:
-        ValueError: if an argument breaks its rule, or the LQR that a default asks for does not exist.
+        ValueError: if an argument breaks its rule, or there is no horizon and no LQR.
 
     Source: Dunn and Bertsekas, "Efficient dynamic programming implementations of Newton's method for
     unconstrained optimal control problems", JOTA 63 (1989); Tassa, Mansard and Todorov, "Control-limited
@@ -98,7 +113,7 @@ class DirectShooting:
         cost: Cost,
         *,
         base: Policy | Sequence[Policy] | None = None,
-        terminal: Value | None = None,
+        terminal: Value | Matrix | None = None,
         low: Limit = None,
         high: Limit = None,
         horizon: float | None = None,
@@ -108,32 +123,25 @@ class DirectShooting:
         starts: int = 6,
         seed: int = 0,
     ) -> None:
-        if system.period is not None or not system.traceable:
-            rule = "must be in continuous time and in torch: it is differentiated twice"
-            raise fail("DirectShooting", "system", rule, type(system).__name__)
-        if isinstance(system, Clocked):
-            rule = "must have no clock: a path is followed by `BoxDDP`"
-            raise fail("DirectShooting", "system", rule, system)
+        check_torch("DirectShooting", "system", system, continuous=True)
+        check_still("DirectShooting", "system", system, "`BoxDDP`")
         cost = cost.bounded(low, high).around(system)
-        if cost.end is not None and horizon is None:
+        if cost.ending is not None and horizon is None:
             raise fail("DirectShooting", "horizon", "must be given beside a terminal cost", None)
-        if cost.discount:
-            raise fail("DirectShooting", "cost", "must have no discount", cost.discount)
+        check_undiscounted("DirectShooting", cost)
         self.stage = Interval(system, cost)
-        rates = (1.0, 1.0)
+        rates = (1.0, 0.0)
         self.lqr: LQR | None = None
         if base is None or terminal is None or horizon is None or intervals is None:
-            self.lqr = LQR(system, cost)
-            rates = _rates(system, self.lqr)
+            self.lqr = self._regulator(horizon, terminal is None and cost.ending is None)
+            rates = rates if self.lqr is None else _rates(system, self.lqr)
         given = () if base is None else tuple(base) if isinstance(base, Sequence) else (base,)
         if not given or (len(given) > 1 and self.lqr is not None):
-            assert self.lqr is not None
-            given = (*given, self.lqr)
-        self.bases = given
-        if terminal is None:
-            assert self.lqr is not None
-            terminal = self.lqr.value if cost.end is None else cost.terminal
-        self.terminal = terminal
+            given = (*given, self._resting if self.lqr is None else self.lqr)
+        self.bases, self.alone = given, base is None and self.lqr is None
+        self.terminal = self._end(terminal)
+        x = set_point(system, cost)[0]
+        self.stays = not restless(system, cost) and float(self.terminal(x.unsqueeze(0)).abs()) <= _NOTHING
         self.stated = (horizon, intervals)
         chosen = _DECAY / rates[0] if horizon is None else horizon
         self.horizon = positive_real("DirectShooting", "horizon", chosen)
@@ -149,6 +157,51 @@ class DirectShooting:
         self.iterations = integer("DirectShooting", "iterations", steps, least=1)
         self.starts = integer("DirectShooting", "starts", starts, least=1)
         self.seed = integer("DirectShooting", "seed", seed, least=0)
+
+    def _regulator(self, horizon: float | None, ends: bool) -> LQR | None:
+        """The LQR of the problem; None where there is none and a horizon does without.
+
+        Args:
+            horizon: s, as it was given.
+            ends: whether a plan would end with its value.
+        """
+        cost, system = self.stage.cost, self.stage.system
+        try:
+            check_regulates("DirectShooting", system, cost)
+            return LQR(system, cost)
+        except ValueError as error:
+            why = str(error)
+        if horizon is None:
+            raise ValueError(
+                f"`DirectShooting(horizon=...)` must be given, in s, where there is no LQR: {why} "
+                "Give a `terminal` as well, V_T of x or S of e'Se, where the end is to count."
+            )
+        if ends:
+            _log.warning(
+                "`DirectShooting` has no LQR (%s): the end of a plan costs nothing: give `terminal`, V_T of x"
+                " or S of e'Se, or a horizon after which nothing counts.",
+                why,
+            )
+        return None
+
+    def _resting(self, x: Tensor) -> Tensor:
+        """The input of the set-point, within the bounds: (..., n) -> (..., m)."""
+        cost = self.stage.cost
+        u = cost.input_of(x.new_zeros(*x.shape[:-1], cost.inputs))
+        return cost.admissible(u)
+
+    def _end(self, terminal: Value | Matrix | None) -> Value:
+        """V_T: as given, of the cost, of the LQR, or nothing."""
+        cost = self.stage.cost
+        if terminal is None:
+            if cost.ending is not None:
+                return cost.terminal
+            return (lambda x: torch.zeros_like(x[..., 0])) if self.lqr is None else self.lqr.value
+        if callable(terminal):
+            return terminal
+        end = square("DirectShooting", "terminal", terminal, cost.dim)
+        end = positive_semidefinite("DirectShooting", "terminal", end, cost.dim)
+        return lambda x: quadratic(end, cost.deviation(x))
 
     def solve(self, x0: Tensor, *, warm: Optimum | None = None) -> Optimum:
         """The optima from x0, (B, n).
@@ -205,6 +258,8 @@ class DirectShooting:
 
     def _believed(self, found: Optimum, x0: Tensor, followed: Tensor) -> Tensor:
         """Rows in which one start is enough, given what following the base costs there: (B,) bool."""
+        if self.alone:  # a kink or a saddle looks stationary
+            return torch.zeros_like(found.converged)
         if self.lqr is None or isinstance(self.stage.system, Linear):
             return found.converged
         ratio = found.value / self.lqr.value(x0)
@@ -214,13 +269,14 @@ class DirectShooting:
     def _rests(self, x0: Tensor, value: Tensor) -> Tensor:
         """Return where the optimum is to stay: at the set-point up to rounding, or at no cost, (B,) bool."""
         rounding = _ROUNDED * torch.finfo(x0.dtype).eps * x0.abs()
-        return (self.stage.cost.deviation(x0).abs() <= rounding).all(-1) | (value == 0)
+        here = (self.stage.cost.deviation(x0).abs() <= rounding).all(-1) | (value == 0)
+        return here & self.stays
 
     def _guessed(self, x0: Tensor, time: Tensor) -> list[MeshPlan]:
         lengths, horizon = time.diff(), float(time[-1])
         plans = [follow(self, _always(base), x0, lengths) for base in self.bases]
         for base in self.bases:
-            several = guesses(self.stage.cost, base, x0, horizon, _SPLINES, self.seed)
+            several = guesses(self.stage.cost, base, x0, horizon, _SPLINES, self.seed, alone=self.alone)
             plans += [follow(self, guided(guess, base), x0, lengths) for guess in several]
         return plans
 
@@ -258,7 +314,8 @@ class DirectShooting:
     def _optimum(self, fine: NewtonSolution, coarse: NewtonSolution, time: Tensor) -> Optimum:
         x0, plan = fine.plan.state[:, 0], fine.plan
         value = self._finer(fine, time.diff()).cost  # the same control, more exactly integrated
-        left = self._left(fine, time) / value
+        size = value.abs()
+        left = self._left(fine, time) / size
         rest = self._rests(x0, value)
         good = fine.converged & torch.isfinite(value) & (left <= _GAP)
         gradient = torch.where(rest.unsqueeze(-1), 0.0, fine.gradient)
@@ -269,12 +326,15 @@ class DirectShooting:
         if isinstance(self.stage.system, ControlAffineSystem):
             control = self.stage.cost.policy(self.stage.system.effectiveness(x0), gradient)
 
-        def where_known(values: Tensor) -> Tensor:
-            return chosen(known, (values,), (torch.full_like(values, torch.nan),))[0]
+        # Where a plant has kinks no plan may be stationary: the cheapest is shown then, as a local one.
+        shown = known | (torch.isfinite(value) & self.alone)
 
-        change = (plan.cost - coarse.plan.cost).abs() / value
+        def where_known(values: Tensor) -> Tensor:
+            return chosen(shown, (values,), (torch.full_like(values, torch.nan),))[0]
+
+        change = (plan.cost - coarse.plan.cost).abs() / size
         change = torch.where(coarse.converged, change, torch.inf)
-        share = self.terminal(plan.state[:, -1]) / value
+        share = self.terminal(plan.state[:, -1]).abs() / size
         return Optimum(
             value=where_known(value),
             gradient=where_known(gradient),
@@ -330,7 +390,7 @@ def _cheapest(plans: list[MeshPlan], count: int, used: Tensor) -> list[MeshPlan]
         used: cost of the plan that was improved already, (B,).
     """
     costs = torch.stack([used, *(plan.cost for plan in plans)])  # (1 + S, B)
-    apart = (costs.unsqueeze(1) - costs).abs() > _MIRRORED * costs
+    apart = (costs.unsqueeze(1) - costs).abs() > _MIRRORED * costs.abs()
     same = ~apart & torch.isfinite(costs)
     earlier = torch.ones_like(same[..., 0]).tril(-1).unsqueeze(-1)  # plan i after plan j
     costs = torch.where((same & earlier).any(1), torch.inf, costs)[1:]
@@ -357,7 +417,9 @@ def _merged(found: Optimum, rows: Tensor, several: list[Optimum]) -> Optimum:
     every = [selected(found, rows), *several]
     values = torch.stack([each.value.nan_to_num(nan=torch.inf) for each in every])  # (S, B')
     best = values.argmin(0)
-    count = (values <= values.amin(0) * (1 + _SAME)).sum(0)  # starts that found the lowest value
+    same = values <= values.amin(0) + _SAME * values.amin(0).abs()
+    known = torch.stack([each.converged for each in every])
+    count = (same & known).sum(0)  # starts that found the lowest value
     places = torch.arange(len(rows))
     columns = {}
     for name, whole in _tensors(found).items():
@@ -372,9 +434,11 @@ def _merged(found: Optimum, rows: Tensor, several: list[Optimum]) -> Optimum:
         if not finite:
             reasons[row] = found.reason[row]
         else:
-            most = max(finite) / min(finite) if min(finite) else math.inf
-            local = f"local: one start alone found it, others up to {most:.3g} times as much"
-            reasons[row] = "" if bool(converged[row]) else local
+            most, least = max(finite), min(finite)
+            others = f"up to {most / least:.3g} times as much" if least > 0 else f"{least:.4g} to {most:.4g}"
+            local = f"local: one start alone found it, others {others}"
+            own = every[int(best[place])].reason[place]
+            reasons[row] = "" if bool(converged[row]) else f"local: {own}" if own else local
     columns["converged"] = converged
     return found._replace(**columns, reason=tuple(reasons))
 

@@ -17,12 +17,12 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from ....numerics.linalg import row_jacobian
+from ....numerics.linalg import row_jacobian, slope_of
 from ....numerics.riccati import riccati_step
 from ....numerics.runge_kutta import SHARES, runge_kutta_mean, runge_kutta_stages, runge_kutta_step
 from ....systems import ControlAffineSystem, Plant
 from ...problem.cost import BoundedInputCost, Cost
-from ..ddp import chosen
+from ..trajectories import chosen
 
 _ROUNDING = 1e-9  # relative promise below which a step that does not pay is one that rounding hides
 _LEAST_CURVATURE = 1e-6  # of its largest eigenvalue, that a convexified interval keeps
@@ -118,13 +118,13 @@ class Interval:
             z = torch.cat((x, v), dim=-1).detach().requires_grad_()
             after, spent = self.advance(z[..., :size], z[..., size:], h)
             # What does not depend on z at all still gets a derivative, 0.
-            rows = [_gradient(after[..., i], z) for i in range(size)]
+            rows = [slope_of(after[..., i], z) for i in range(size)]
             slope = torch.stack(rows, dim=-2)
-            gradient = _gradient(spent, z)
+            gradient = slope_of(spent, z)
             costate = adjoint(slope[..., :size], gradient[..., :size], end)
             weighted = spent + (costate * after).sum(-1)
-            (along,) = torch.autograd.grad(weighted.sum(), z, create_graph=True)
-            columns = [_gradient(along[..., i], z) for i in range(z.shape[-1])]
+            along = slope_of(weighted, z, create_graph=True)
+            columns = [slope_of(along[..., i], z) for i in range(z.shape[-1])]
         curvature = torch.stack(columns, dim=-1)
         return Expansion(slope, gradient, 0.5 * (curvature + curvature.mT))
 
@@ -141,12 +141,6 @@ def adjoint(slope: Tensor, gradient: Tensor, end: Tensor) -> Tensor:
     for k in range(slope.shape[1] - 1, 0, -1):
         costates.append(gradient[:, k] + (slope[:, k] * costates[-1].unsqueeze(-1)).sum(-2))
     return torch.stack(costates[::-1], dim=1)
-
-
-def _gradient(values: Tensor, z: Tensor) -> Tensor:
-    if not values.requires_grad:
-        return torch.zeros_like(z)
-    return torch.autograd.grad(values.sum(), z, retain_graph=True, materialize_grads=True)[0]
 
 
 def closed_stage(stage: Interval, policy: Callable[[Tensor], Tensor], x: Tensor, h: Tensor) -> Tensor:
@@ -350,7 +344,7 @@ def minimise(problem: ShootingProblem, plan: MeshPlan, lengths: Tensor) -> Newto
     count = torch.zeros(batch, dtype=torch.int64, device=plan.cost.device)
     kept, rough = _step(problem, plan, lengths, rough)
     for _ in range(problem.iterations):
-        promise = kept.decrement / plan.cost
+        promise = kept.decrement / plan.cost.abs()
         done = done | (~stuck & kept.definite & (promise <= problem.tolerance))
         if bool((done | stuck).all()):  # costs time alone: rows that are done no longer move
             break
@@ -362,7 +356,7 @@ def minimise(problem: ShootingProblem, plan: MeshPlan, lengths: Tensor) -> Newto
         stuck = stuck | (moving & ~lower & ~done & rough)
         step, rough = _step(problem, plan, lengths, moving & ~lower)  # convexified where it did not pay
         kept = chosen(done | stuck, kept, step)
-    promise = torch.where(kept.definite, kept.decrement / plan.cost, torch.inf)
+    promise = torch.where(kept.definite, kept.decrement / plan.cost.abs(), torch.inf)
     return NewtonSolution(plan, kept.feedback, kept.gradient, done, kept.costates, promise, count)
 
 
@@ -386,10 +380,7 @@ def _derivatives(value: Callable[[Tensor], Tensor], x: Tensor) -> tuple[Tensor, 
     """First and second derivatives of V_T: (B, n) -> (B, n), (B, n, n)."""
     with torch.enable_grad():
         at = x.detach().requires_grad_()
-        (slope,) = torch.autograd.grad(value(at).sum(), at, create_graph=True)
-        rows = [
-            torch.autograd.grad(s.sum(), at, retain_graph=True, materialize_grads=True)[0]
-            for s in slope.unbind(-1)
-        ]
+        slope = slope_of(value(at), at, create_graph=True)
+        rows = [slope_of(s, at) for s in slope.unbind(-1)]
     curvature = torch.stack(rows, dim=-2)
     return slope.detach(), 0.5 * (curvature + curvature.mT)

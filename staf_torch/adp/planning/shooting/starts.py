@@ -24,7 +24,7 @@ class StartControl(NamedTuple):
 
 
 def guesses(
-    cost: Cost, base: Policy, x0: Tensor, horizon: float, count: int, seed: int
+    cost: Cost, base: Policy, x0: Tensor, horizon: float, count: int, seed: int, *, alone: bool = False
 ) -> list[StartControl]:
     """Constant controls at both bounds for several times, none at all, and random splines.
 
@@ -35,10 +35,11 @@ def guesses(
         horizon: s.
         count: random splines.
         seed: of them.
+        alone: whether the base is the input at rest: it does not say how large a control is.
     """
     rest = torch.zeros(cost.inputs, dtype=torch.float64)
     rest = rest if cost.target_input is None else cost.target_input
-    wanted = (base(x0) - rest.to(x0)).abs().amax(0).clamp(min=1e-3).to(rest)
+    wanted = (base(x0) - rest.to(x0)).abs().amax(0).clamp(min=1.0 if alone else 1e-3).to(rest)
     low, high = rest - _REACH * wanted, rest + _REACH * wanted
     if cost.bounds is not None:
         low, high = (

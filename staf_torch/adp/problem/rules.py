@@ -1,0 +1,234 @@
+"""Rules about a plant with its cost, each written once: every door asks those it needs before it computes.
+
+A regulator needs a plant that rests at the set-point, an input within the bounds that holds it there, and a
+linearisation that can be stabilised. A plan over a horizon, or a loop over some steps, needs none of these.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from ...numerics.checks import fail, positive_real
+from ...systems import Bounds, Clocked, Plant
+from ...systems.equilibria import check_rest
+from .cost import Cost
+from .held_linear import HeldLoop
+
+_log = logging.getLogger(__name__)
+_NEAR, _NOTHING = 1e-4, 1e-9  # of a state around the set-point, and of the cost rate there
+_CONSTANTS = 0.5  # time constants of the slowest mode that a horizon must have
+
+
+def check_torch(call: str, argument: str, plant: Plant, *, continuous: bool = False) -> None:
+    """Refuse a plant with something that torch cannot differentiate, or one in discrete time.
+
+    Raises:
+        ValueError: in the name of ``call`` and its argument.
+    """
+    kind = "in torch all through" if not continuous else "in continuous time and in torch all through"
+    if not plant.traceable or (continuous and plant.period is not None):
+        rule = f"must be {kind}: trajectories are optimised by its second derivatives"
+        raise fail(call, argument, rule, type(plant).__name__)
+
+
+def check_still(call: str, argument: str, plant: Plant, instead: str) -> None:
+    """Refuse a plant with a clock, with who follows a path ``instead``."""
+    if isinstance(plant, Clocked):
+        raise fail(call, argument, f"must have no clock: a path is followed by {instead}", plant)
+
+
+def check_undiscounted(call: str, cost: Cost) -> None:
+    """Refuse a cost with a discount."""
+    if cost.discount:
+        raise fail(call, "cost", "must have no discount", cost.discount)
+
+
+def check_endless(call: str, argument: str, end: object, why: str) -> None:
+    """Refuse a terminal cost ``end`` of a door that knows no end."""
+    if end is not None:
+        raise fail(call, argument, f"must have no terminal cost: {why}", end)
+
+
+def check_regulator(call: str, argument: str, why: str) -> None:
+    """Refuse a problem without a linear regulator, ``why``, of a door that leads to the goal; "" with one."""
+    if why:
+        raise ValueError(f"`{call}({argument}=...)` must have a linear regulator at its goal: {why}")
+
+
+def held_period(call: str, plant: Plant, dt: float | None) -> float:
+    """Return the time for which a control is held, s: ``dt``, by default a step of a plant in discrete time.
+
+    Raises:
+        ValueError: if it is not positive.
+    """
+    return positive_real(call, "dt", plant.period if dt is None else dt)
+
+
+def own_period(call: str, plant: Plant, dt: float | None) -> float:
+    """`held_period` of a door that takes a plant in discrete time at its own period alone."""
+    if plant.period is not None and dt not in (None, plant.period):
+        raise fail(call, "dt", f"must be the plant's period, {plant.period} s", dt)
+    return held_period(call, plant, dt)
+
+
+def check_within(call: str, argument: str, bounds: Bounds | None, u: Tensor) -> None:
+    """Refuse bounds that do not contain the input which holds the plant at the set-point.
+
+    Args:
+        call: the door.
+        argument: of it.
+        bounds: of the inputs, None for none.
+        u: the input, (m,).
+
+    Raises:
+        ValueError: if it lies outside; a warning in the log if it lies on a bound.
+    """
+    if bounds is None:
+        return
+    low, high = bounds.low.tolist(), bounds.high.tolist()
+    if not bool(bounds.contain(u)):
+        rule = f"must hold the plant at the set-point with an input within the bounds, {low} and {high}"
+        raise fail(call, argument, rule, u.tolist())
+    if bool(((u == bounds.low) | (u == bounds.high)).any()):
+        _log.warning(
+            "`%s`: the input %s that holds the plant at the set-point lies on a bound, %s and %s: a feedback "
+            "can push one way only.",
+            *(call, u.tolist(), low, high),
+        )
+
+
+def regulated(call: str, plant: Plant, cost: Cost, argument: str = "cost") -> Cost:
+    """Return the cost around the plant, of a door that regulates: the plant rests within the bounds.
+
+    Args:
+        call: the door.
+        plant: the plant.
+        cost: the cost rate.
+        argument: of the door, which is named where an input is out of bounds.
+
+    Raises:
+        ValueError: if the sizes differ, the plant does not rest at the set-point, or its input is not within
+            the bounds.
+    """
+    placed = cost.around(plant)
+    _check_held(call, plant, placed, argument)
+    return placed
+
+
+def set_point(plant: Plant, cost: Cost) -> tuple[Tensor, Tensor]:
+    """Return the state and the input, (n,) and (m,), at which a cost around a plant wants it to rest."""
+    x = plant.equilibrium() if cost.target is None else cost.target
+    none = torch.zeros(cost.inputs, dtype=torch.float64)
+    return x, none if cost.target_input is None else cost.target_input
+
+
+def check_regulates(call: str, plant: Plant, cost: Cost) -> None:
+    """Refuse an economic cost: one whose rate is not 0 at the set-point, or less somewhere beside it.
+
+    Args:
+        call: the door.
+        plant: the plant.
+        cost: around it, of a path or a set-point.
+    """
+    still_plant, still = cost.regulated(plant)
+    x = set_point(still_plant, still)[0]
+    near = _NEAR * (1 + x.abs()) * torch.eye(len(x), dtype=x.dtype)
+    with torch.no_grad():
+        rates = still.state_rate(torch.cat((x.unsqueeze(0), x + near, x - near)))
+    at, least = float(rates[0]), float(rates.min())
+    if abs(at) > _NOTHING or not least >= at - _NOTHING:
+        rule = "must be 0 at the set-point and not less beside it, for a regulator"
+        raise fail(call, "cost", f"{rule}: its rate is {at:.6g} there and {least:.6g} beside it", x.tolist())
+
+
+def restless(plant: Plant, cost: Cost) -> str:
+    """Return why nothing keeps a plant at the set-point of a cost at no cost; "" where something does.
+
+    Args:
+        plant: the plant.
+        cost: around it, of a path or a set-point.
+    """
+    try:
+        check_regulates("restless", plant, cost)
+        _check_held("restless", plant, cost, "cost")
+    except ValueError as error:
+        return str(error)
+    return ""
+
+
+def warn_if_restless(call: str, plant: Plant, cost: Cost) -> None:
+    """Say in the log that nothing holds a plant at the set-point of a cost, which is paid for ever then.
+
+    Nothing is said of an economic cost, which has no set-point.
+    """
+    try:
+        check_regulates(call, plant, cost)
+    except ValueError:
+        return
+    try:
+        _check_held(call, plant, cost, "cost")
+    except ValueError as error:
+        _log.warning("`%s`: nothing holds the plant at the set-point: %s", call, error)
+
+
+def _check_held(call: str, plant: Plant, placed: Cost, argument: str) -> None:
+    """Refuse a set-point at which no input within the bounds holds the plant."""
+    still_plant, still = placed.regulated(plant)
+    x, u = set_point(still_plant, still)
+    check_rest(still_plant, x, u)
+    check_within(call, argument, placed.bounds, u)
+
+
+def slowest(policy: Callable[[Tensor], Tensor], plant: Plant, cost: Cost, period: float) -> float:
+    """Return the decay of the slowest mode of a held, linearised loop, 1/s."""
+    radius = HeldLoop.of(policy, plant, at=cost.target).spectral_radius(period)
+    return -math.log(max(min(radius, 1 - 1e-9), 1e-9)) / period
+
+
+def warn_if_short(call: str, argument: str, horizon: float, decay: float) -> None:
+    """Say in the log that a horizon ends before the loop has decayed once.
+
+    Args:
+        call: the door.
+        argument: that states the horizon.
+        horizon: s.
+        decay: of the slowest mode, 1/s.
+    """
+    if horizon * decay < _CONSTANTS:
+        _log.warning(
+            "`%s(%s=...)`: the horizon of %.3g s is %.2g time constants of the slowest mode of the regulated "
+            "plant: what lies beyond is left to the linear regulator's value. Take %.3g s.",
+            *(call, argument, horizon, horizon * decay, 4 * _CONSTANTS / decay),
+        )
+
+
+def warn_if_unstable(policy: Callable[[Tensor], Tensor], plant: Plant, cost: Cost, dt: float) -> float:
+    """Say in the log that the linearised loop of a policy held for dt is not stable, and which period is.
+
+    Returns:
+        The fastest mode of the linearised plant without control, 1/s; inf where it is not known.
+    """
+    held = HeldLoop.of(policy, plant, at=cost.set_point())
+    radius = held.spectral_radius(dt)
+    fastest = float(torch.linalg.eigvals(held.f).abs().max()) if held.finite else math.inf
+    if not radius >= 1:
+        return fastest
+    most = held.largest_period()
+    remedy = "at no period" if most is None else f"up to {most:.4g} s"
+    made = getattr(policy, "period", None)
+    advice = (
+        "This policy was made for that period: look at the plant and the cost."
+        if made == dt
+        else "`LQR(plant, cost, period=dt)` is made to be held."
+    )
+    _log.warning(
+        "the control is held for dt = %.4g s, at which the linearised loop has the spectral radius %.4g: it "
+        "is unstable; it is stable %s. %s",
+        *(dt, radius, remedy, advice),
+    )
+    return fastest
