@@ -2,9 +2,10 @@
 
 A policy is asked ten times in a test and a hundred thousand times in a control loop. Its class says in one
 line that a method may be compiled, ``@compiled("a policy")``; the method stays plain torch, which is what it
-means. Calls are counted, and from the hundredth on a program serves. It is made anew when anything that the
-owner holds has changed (`contents`), is no part of a pickle or a copy, and is out of the way where somebody
-traces or differentiates. To compile at construction would take seconds of every short test.
+means. A program serves once the calls in plain torch have taken as long as a compiler, by their operations
+(`plain_time`), and from the hundredth call on at the latest. It is made anew when anything that the owner
+holds has changed (`contents`), is no part of a pickle or a copy, and is out of the way where somebody traces
+or differentiates. To compile at construction would take seconds of every short test.
 """
 
 from __future__ import annotations
@@ -21,11 +22,12 @@ from torch import Tensor, nn
 from .call import PlannedCall, ordinary
 from .contents import BOUND, Contents
 from .loops import tracing_now
+from .plain_time import PlainTime
 from .program import Program
 from .shared_programs import shared_program
 from .tree import Tree, flatten, unflatten
 
-_PAYS = 100  # calls of a small batch in plain torch (some 10 ms each) that take as long as to compile
+_PAYS = 100  # calls of a small batch in plain torch after which it is compiled, however short they are
 _KEPT = 64  # shapes of calls that are remembered
 WHEN = ("auto", "always", "never")
 _when = "auto"
@@ -62,6 +64,11 @@ def compiling(when: str) -> Iterator[None]:
         _when = before
 
 
+def undecided(compile: bool | str = "auto") -> bool:
+    """Return whether a caller, and `compiling`, leave the choice to the library."""
+    return compile == "auto" and _when == "auto"
+
+
 def worth(pays: bool) -> bool:
     """Return whether an automatic choice falls on compiled code, where a call would pay or not."""
     return pays if _when == "auto" else _when == "always"
@@ -94,7 +101,7 @@ class compiled:  # noqa: N801
     Args:
         name: in the log; programs of one name share texts.
         by: makes what serves for an owner; one program of the method by default.
-        pays: calls of a small batch in plain torch that take as long as to compile; inf: not before `hasten`.
+        pays: calls of a small batch after which it is compiled at the latest; inf: not before `hasten`.
         copies: as in `Program`.
     """
 
@@ -145,6 +152,7 @@ class CompiledMethod:
     def __init__(self, definition: Callable[..., Tree], owner: Any, settings: compiled) -> None:
         self.definition, self.owner, self._settings = definition, owner, settings
         self._asked, self.waits = 0.0, False  # whether it was to be compiled, and has not been called since
+        self._plain: tuple[PlainTime, float] | None = None  # of its first call, with so many rows
         self._served: Served | None = None
         self._read: Contents | None = None
 
@@ -156,8 +164,10 @@ class CompiledMethod:
         """y: (..., n) -> (..., m), or trees of (B, ...)."""
         if not ordinary(flatten((x, *more))[0] if more else (x,)) or x.numel() == 0 or tracing_now():
             return self.definition(x, *more)
-        if (self._served is None or _when == "never") and not self._pays(x.numel() / x.shape[-1]):
-            return self.definition(x, *more)
+        if self._served is None or _when == "never":
+            rows = x.numel() / x.shape[-1]
+            if not self._pays(rows):
+                return self._counted(rows, x, *more)
         if self._read is None or not self._read.unchanged(library=False):
             self._served = self._compile(trees=bool(more))
         self.waits = False
@@ -171,10 +181,23 @@ class CompiledMethod:
     def _pays(self, rows: float) -> bool:
         """Return whether the calls so far and this one repay a compiler: a large batch does by itself."""
         work, most = rows / 200, self._settings.pays
+        if self._plain is not None:
+            plain, counted = self._plain
+            work = max(work, most * plain.seconds(rows / counted) / plain.build)
         pays = self._asked + work >= most
         pays = worth(pays) if most < math.inf else pays
         self._asked += 0.0 if pays else 1 + work
         return pays
+
+    def _counted(self, rows: float, x: Tensor, *more: Tree) -> Any:
+        """Compute by the definition, the first time with a count of its operations."""
+        if self._plain is not None or not undecided() or self._settings.pays == math.inf:
+            return self.definition(x, *more)
+        with PlainTime() as plain:
+            found = self.definition(x, *more)
+        self._plain = plain, rows
+        self._asked = max(self._asked, self._settings.pays * plain.seconds() / plain.build)
+        return found
 
     @property
     def compiled(self) -> bool:
@@ -195,7 +218,7 @@ class CompiledMethod:
 
 
 def ready(module: nn.Module, x: Tensor) -> bool:
-    """Compile now what serves calls like ``module(x)``: no control loop must wait for it at its 100th call.
+    """Compile now what serves calls like ``module(x)``: no control loop must wait for it later.
 
     Policies of `staf_torch.adp` run in plain torch until their calls would have paid for a compiler. It takes
     one second to thirty, once; from the user's cache the machine code is there in milliseconds.

@@ -328,7 +328,7 @@ def _loops_over(now: Tree) -> bool:
 
 def _say(name: str, reason: str, kind: str | None = None) -> None:
     """Log why a program runs in plain torch, once for a reason or a kind of reasons."""
-    reason = " ".join(reason.split())[:400]
+    reason = " ".join(reason.split())[:600]
     told = name, reason if kind is None else kind
     if told not in _said:
         _said.add(told)

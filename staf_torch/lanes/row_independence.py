@@ -75,14 +75,24 @@ def _alike(step: Callable[..., Any], given: Given, rows: Sequence[int], beside: 
 @contextmanager
 def undrawn() -> Iterator[None]:
     """Put the states of all common random numbers back at the end: to compile draws none."""
-    common = np.random.get_state()  # noqa: NPY002 - a user's code draws from it
-    states = torch.get_rng_state(), common, random.getstate()
+    put_back = generators()
     try:
         yield
     finally:
+        put_back()
+
+
+def generators() -> Callable[[], None]:
+    """Return the function that puts the states of all common random numbers back to what they are now."""
+    common = np.random.get_state()  # noqa: NPY002 - a user's code draws from it
+    states = torch.get_rng_state(), common, random.getstate()
+
+    def put_back() -> None:
         torch.set_rng_state(states[0])
         np.random.set_state(states[1])  # noqa: NPY002
         random.setstate(states[2])
+
+    return put_back
 
 
 def _farthest(given: Given) -> int:

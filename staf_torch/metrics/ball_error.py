@@ -10,12 +10,14 @@ from torch import Tensor
 from ..approximation.basis import StaFBasis, Target
 from ..centers import probe_points
 from ..lanes import Program, reduce, shared_program
+from ..lanes.compiled_methods import undecided, worth
+from ..lanes.plain_time import PlainTime
 from ..local_basis import NewtonSpace, evaluate_scaled, scale
 from ..numerics.linalg import condition_number
 
 PROBES = 97  # points of the ball to take a supremum over; in the plane 64 of them on its edge
 _BLOCK = 2**18  # numbers in a temporary of plain torch, so that it stays in cache
-_PAYS = 30_000  # states in plain torch (some 30 us each) that take as long as to compile
+_PAYS = 30_000  # states in plain torch (some 30 us each) after which it is compiled, however short they are
 
 
 class StateErrors(NamedTuple):
@@ -58,6 +60,7 @@ class StateErrorPass:
         self._basis, self._target, self._points, self._compile = basis, target, points, compile
         self._fixed: _Fixed | None = None
         self._seen, self.compiled = expected, False
+        self._share = 0.0  # of a build that a state takes in plain torch, by the operations of the first ones
         self._program: Program | None = None
 
     def __call__(self, x: Tensor, coefficients: Tensor, ideal: Tensor) -> StateErrors:
@@ -71,7 +74,7 @@ class StateErrorPass:
         if self._fixed is None:
             self._fixed = _Fixed.of(self._basis, x, self._points)
         self._seen += x.numel() // x.shape[-1]
-        if self._compile is True or (self._compile == "auto" and self._seen >= _PAYS):
+        if self._pays():
             row = tuple(part.reshape(-1, part.shape[-1]) for part in (x, coefficients, ideal))
             if self._program is None:
                 parts = self._basis, self._target, self._fixed
@@ -85,8 +88,22 @@ class StateErrorPass:
         width = self._points * self._basis.count
         times = max(1, _BLOCK // (width * max(1, x.numel() // x.shape[-1] // x.shape[-2])))
         blocks = zip(*(part.split(times, dim=-2) for part in (x, coefficients, ideal)), strict=True)
-        columns = zip(*(self._at(*block) for block in blocks), strict=True)
+        found = [self._counted(next(blocks)), *(self._at(*block) for block in blocks)]
+        columns = zip(*found, strict=True)
         return StateErrors(*(torch.cat(column, dim=-1) for column in columns))
+
+    def _pays(self) -> bool:
+        pays = self._seen >= _PAYS or self._seen * self._share >= 1
+        return worth(pays) if self._compile == "auto" else bool(self._compile)
+
+    def _counted(self, block: tuple[Tensor, ...]) -> StateErrors:
+        """The errors at the first states, and how long they take."""
+        if self._share or not undecided(self._compile):
+            return self._at(*block)
+        with PlainTime() as plain:
+            errors = self._at(*block)
+        self._share = plain.seconds() / plain.build / max(1, errors.ball_error.numel())
+        return errors
 
     def _at(self, x: Tensor, coefficients: Tensor, ideal: Tensor) -> StateErrors:
         """The definition, in which no state sees another: (..., n), (..., M), (..., M)."""

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from ..lanes import Program, shared_program
-from ..lanes.compiled_methods import worth
+from ..lanes.compiled_methods import undecided, worth
+from ..lanes.loop_program import LoopProgram
 from ..lanes.tree import Tree
 from ..numerics.checks import integer, positive_real, trailing
 from ..numerics.runge_kutta import runge_kutta_step
@@ -54,8 +55,13 @@ def trajectory(
     def step(x: Tensor, now: Tree, row: Tree) -> tuple[Tensor, Tensor]:
         return runge_kutta_step(lambda at: _drift(system, at), x, dt), x  # the state before every step
 
+    def compiled() -> Program:
+        return shared_program("a trajectory", step, system, dt)
+
     pays, x = worth(total * (1 + len(x0) / 200) >= _PAYS), x0
-    program = shared_program("a trajectory", step, system, dt) if pays else Program(step, compile=False)
+    program: Program | LoopProgram = compiled() if pays else Program(step, name="a trajectory", compile=False)
+    if isinstance(program, Program) and not pays and undecided():
+        program = LoopProgram(program, compiled, total)
     for start in range(0, total, size):
         stop = min(start + size, total)
         time = torch.arange(start, stop, dtype=torch.float64) * dt

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from ...lanes import Program
-from ...lanes.compiled_methods import worth
+from ...lanes.compiled_methods import undecided, worth
+from ...lanes.loop_program import LoopProgram
 from ...lanes.tree import flatten, unflatten
 from ...numerics.checks import choice, copied, fail, integer, positive_real, trailing
 from ...systems import ControlAffineSystem, Plant
@@ -148,8 +149,10 @@ def simulate(
             above 1e-5 of the state within a period, by this or by your own choice, is a warning in the log.
         limit: as in `ClosedLoop`.
         compile: whether the loop is compiled by `lanes`: True, False, or ``auto`` (where the run is long
-            enough to pay for it, and never with a controller that improves plans: some seconds, once). What
-            cannot be compiled runs in plain torch, which is the definition, with one line in the log.
+            enough to pay for it by the operations of its first step, so that the choice is always the same;
+            never with a controller that improves plans: some seconds, once). What cannot be compiled runs in
+            plain torch, which is the definition, with one line in the log, and a loop in plain torch that
+            takes more than some seconds says how many. Both agree to some 1e-12; True or False fix the bits.
         progress: called with the number of steps done since its last call.
 
     Raises:
@@ -201,6 +204,17 @@ def simulate(
         return whole.checked(loop, result, strained, substeps is None and integrator != "euler")
 
 
+def _beginning(loop: ClosedLoop, plain: Program, steps: int) -> LoopProgram:
+    """Return the program of a loop that few and cheap steps would not repay to compile."""
+    if not loop.system.traceable:
+        return LoopProgram(plain, None, steps, remedy=": a plant that is no torch is called at every step")
+    if any(getattr(part, "costly", False) for part in loop.controller.modules()):
+        remedy = ": `compile=True` compiles this controller, too, which takes up to a minute, once"
+        return LoopProgram(plain, None, steps, remedy=remedy)
+    remedy = ": `compile=True` compiles it, where it is torch all through"
+    return LoopProgram(plain, lambda: program(loop, True), steps, remedy=remedy)
+
+
 @dataclasses.dataclass(frozen=True)
 class _Run:
     """What `simulate` runs, again for some rows with other steps."""
@@ -219,7 +233,8 @@ class _Run:
         pays = work * (1 + len(self.x0) / 200) >= _PAYS
         pays = pays and not any(getattr(part, "costly", False) for part in parts)
         compiled = (worth(pays) if self.compile == "auto" else bool(self.compile)) and loop.system.traceable
-        ran = program(loop, compiled)
+        found = program(loop, compiled)
+        ran = _beginning(loop, found, self.steps) if not compiled and undecided(self.compile) else found
         return _run(loop, ran, self.x0, self.steps, self.every, self.seeds, self.progress)
 
     def checked(self, loop: ClosedLoop, result: LoopResult, rows: Tensor, again: bool) -> LoopResult:
@@ -261,7 +276,7 @@ class _Run:
 
 def _run(
     loop: ClosedLoop,
-    steps_of: Program,
+    steps_of: Program | LoopProgram,
     x0: Tensor,
     steps: int,
     every: int,

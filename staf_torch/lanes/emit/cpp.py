@@ -23,6 +23,8 @@ from .statements import StatementWriter
 
 _FEW = 400  # nodes of a program of which two vectors fit the registers and caches side by side
 _WRITTEN_OUT = 8  # entries of an output that are stored one by one
+_CALLED = 64  # functions beyond which each is compiled once and called: written out, one takes g++ 20 ms
+_LIBRARY = frozenset(("exp", "expm1", "log", "log1p", "sin", "cos", "tan", "tanh"))
 _MANY = 1500  # nodes of which even a matrix that the vectors share does not pay for twice the text
 _COSTLY, _MEMORY = 20, 4  # operations that a function takes, and that a number written and read is worth
 _FUNCTIONS = frozenset(
@@ -101,9 +103,12 @@ class _CppWriter(StatementWriter):
             "SLOTS_NOW": len(layout.nows),
         }
         counts |= {"SLOTS_CARRY": len(layout.carries), "COPIES": self.copies, "TILE": 64}
-        single = self.graph.single
+        single, graph = self.graph.single, self.graph
+        functions = sum(graph.op[node] in _LIBRARY for node in self.schedule.live) * self.copies
+        calls = ["#define LANES_CALLS 1"] if functions > _CALLED else []
         head = [f"#define LANES_SINGLE {int(single)}", f"#define REAL {'float' if single else 'double'}"]
         head += [
+            *calls,
             '#include "_lanes.hpp"',
             f"constexpr int {', '.join(f'{k} = {v}' for k, v in counts.items())};",
         ]

@@ -87,6 +87,14 @@ def cumprod(x: Tensor, dim: int, *, dtype: torch.dtype | None = None) -> Tensor:
     return torch.stack(parts, dim)
 
 
+def logcumsumexp(x: Tensor, dim: int) -> Tensor:
+    """The logarithms of the sums of the exponentials so far."""
+    parts = list(x.unbind(dim)) if x.dim() else [x]
+    for k in range(1, len(parts)):
+        parts[k] = torch.logaddexp(parts[k - 1], parts[k])
+    return torch.stack(parts, dim) if x.dim() else x.clone()
+
+
 def _product(x: Tensor, dims: Sequence[int] | None, *, output_dtype: torch.dtype | None = None) -> Tensor:
     axes = range(x.dim()) if dims is None else [d % x.dim() for d in dims]
     x = x if output_dtype is None else x.to(output_dtype)
@@ -157,6 +165,7 @@ REPLACEMENTS: dict[str, Callable[..., Any]] = {
     "cummax": functools.partial(_running, beats=torch.ge),
     "cummin": functools.partial(_running, beats=torch.le),
     "cumprod": cumprod,
+    "logcumsumexp": logcumsumexp,
     "prims::prod": _product,
     "prims::sum": _sum,
     "prims::var": _variance,

@@ -67,13 +67,7 @@ def _sum_of_two(t: Tracer, out: Tensor, a: Any, b: Any, alpha: Any = 1, _name: s
 
 
 RULES["sub"] = functools.partial(_sum_of_two, _name="sub")
-RULES["rsub"] = lambda t, out, a, b, alpha=1: _sum_of_two(t, out, b, _times(t, out, a, alpha), _name="sub")
-
-
-def _times(t: Tracer, out: Tensor, a: Tensor, alpha: Any) -> Tensor:
-    if alpha != 1:
-        raise NotLoweredError("`aten.rsub` with alpha has no scalar form here")
-    return a
+RULES["rsub"] = lambda t, out, a, b, alpha=1: _sum_of_two(t, out, b, a, alpha, _name="sub")
 
 
 @rule("div")
@@ -222,7 +216,7 @@ for _name in ("eq", "ne"):
 def _logic(op: str, *names: str) -> None:
     def rule(t: Tracer, out: Tensor, *args: Any) -> Ids:
         if out.dtype != torch.bool:
-            raise NotLoweredError("logic on the bits of integers has no scalar form here")
+            raise NotLoweredError("logic on the bits of integers has no scalar form here", "bitwise")
         return t.map(op, *numbers(t, FLAG, *args))
 
     RULES.update(dict.fromkeys(names, rule))
@@ -236,6 +230,12 @@ _multiply = RULES["mul"]
 RULES["mul"] = lambda t, out, a, b: (
     t.map("and", *numbers(t, FLAG, a, b)) if out.dtype == torch.bool else _multiply(t, out, a, b)
 )
+
+
+@rule("signbit")
+def _signbit(t: Tracer, out: Tensor, a: Tensor) -> Ids:
+    kind = t.kind(a.dtype)  # of zeros, too
+    return t.map("lt", t.map("copysign", t.nodes(1.0, kind), t.nodes(a)), t.nodes(0.0, kind))
 
 
 @rule("isnan")

@@ -68,7 +68,8 @@ def added_at(t: Tracer, out: Tensor, a: Tensor, dim: int, index: Tensor, source:
 def _accumulated(t: Tracer, out: Tensor, a: Tensor, index: Sequence[Tensor | None], source: Tensor) -> Ids:
     """Entries added at an index that no row computes: the slope of an entry that was read twice, say."""
     if any(isinstance(i, Tensor) and (t.traced(i) or not t.stated(i)) for i in index):
-        raise NotLoweredError("`aten.index_put` at an index that the row computes has no scalar form here")
+        reason = "`aten.index_put` at an index that the row computes has no scalar form here"
+        raise NotLoweredError(reason, "scatter_add")
     kind = t.kind(out.dtype)
     places = torch.arange(a.numel()).reshape(a.shape)[tuple(slice(None) if i is None else i for i in index)]
     nodes = np.broadcast_to(t.nodes(a, kind), a.shape).reshape(-1).copy()
@@ -107,7 +108,9 @@ def _indexed(
         chosen = _chosen(t, entries[(..., *[None] * index.dim(), slice(None))], t.nodes(index, WHOLE))
         return np.moveaxis(chosen, range(a.dim() - 1, chosen.ndim), range(dim, dim + index.dim()))
     if name not in ("gather", "scatter"):
-        raise NotLoweredError(f"`aten.{name}` at an index that the row computes has no scalar form here")
+        masked = any(isinstance(i, Tensor) and i.dtype == torch.bool for i in (*_listed(dim), index))
+        reason = f"`aten.{name}` at {'a mask' if masked else 'an index'} that the row computes"
+        raise NotLoweredError(f"{reason} has no scalar form here", "index" if masked else "gather")
     x = np.moveaxis(t.nodes(a, kind), dim, -1)
     at = np.moveaxis(t.nodes(index, WHOLE), dim, -1)
     if name == "gather":

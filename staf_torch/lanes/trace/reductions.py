@@ -128,10 +128,17 @@ def _length(t: Tracer, flat: Ids, order: float) -> Ids:
     """The norm over the last dimension."""
     if order == 2:
         return t.map("sqrt", t.total(t.map("mul", flat, flat)))
-    if order in (1, math.inf):
-        size = t.map("abs", flat)
-        return t.total(size) if order == 1 else _chain(t, "max", size)
-    raise NotLoweredError(f"a norm of order {order} has no scalar form here")
+    size = t.map("abs", flat)
+    if math.isinf(order):
+        return _chain(t, "max" if order > 0 else "min", size)
+    kind = t.graph.type[int(flat.flat[0])]
+    if order == 0:
+        return t.total(t.cast(t.map("ne", size, t.nodes(0.0, kind)), kind))
+    if order == 1:
+        return t.total(size)
+    return t.map(
+        "pow", t.total(t.map("pow", size, t.nodes(float(order), kind))), t.nodes(1 / float(order), kind)
+    )
 
 
 @rule("_cdist_forward")
@@ -176,7 +183,9 @@ RULES["dot"] = RULES["vdot"] = _mv
 def _addmm(
     t: Tracer, out: Tensor, bias: Tensor, a: Tensor, b: Tensor, beta: float = 1, alpha: float = 1
 ) -> Ids:
-    if beta != 1 or alpha != 1:
-        raise NotLoweredError("a scaled product has no scalar form here")
-    product = (_mv if b.dim() == 1 else _mm)(t, out, a, b)
-    return t.map("add", product, t.nodes(bias, t.kind(out.dtype)))
+    kind = t.kind(out.dtype)
+    product, added = (_mv if b.dim() == 1 else _mm)(t, out, a, b), t.nodes(bias, kind)
+    product = product if alpha == 1 else t.map("mul", t.nodes(float(alpha), kind), product)
+    if beta == 0:  # torch: also where the other is no number
+        return product
+    return t.map("add", product, added if beta == 1 else t.map("mul", t.nodes(float(beta), kind), added))

@@ -27,6 +27,7 @@ from .decompositions import REPLACEMENTS
 from .entrywise import RULES
 from .graph import NOW, STEP, Graph
 from .indexing import CHOICES, MOVEMENTS, added_at, many, moved
+from .matrix_exponential import matrix_exponential
 from .tracer import NotLoweredError, Tracer
 
 RULES["scatter_add"] = added_at
@@ -56,7 +57,7 @@ def lower(t: Tracer, func: Any, name: str, out: Any, args: Sequence[Any], kwargs
     if decomposition is None and func._can_decompose():  # of several operations, also in torch
         decomposition = func.decompose
     if decomposition is None:
-        raise NotLoweredError(f"`{func}` has no scalar form here")
+        raise NotLoweredError(f"`{func}` has no scalar form here", plain)
     with t:
         result = decomposition(*args, **kwargs)
     parts = [result] if isinstance(result, Tensor) else list(result)
@@ -118,7 +119,7 @@ def trace(step: Step, given: Given, *, widened: bool = False, folded: bool = Fal
         if structure != given.structures["carry"] or [(e.shape, e.dtype) for e in ends] != [
             (c.shape, c.dtype) for c in carry
         ]:
-            raise NotLoweredError("the step returns a carry of other shapes or dtypes than it was given")
+            raise NotLoweredError(_other_carry("the step returns", ends, carry))
         leaves, shape = flatten(out)
         if any(leaf.dim() == 0 or leaf.shape[0] != 1 for leaf in leaves):
             raise NotLoweredError("an output of the step has no dimension of rows")
@@ -132,6 +133,18 @@ def trace(step: Step, given: Given, *, widened: bool = False, folded: bool = Fal
         )
     shapes = tuple((leaf.shape[1:], leaf.dtype) for leaf in leaves)
     return Traced((graph, layout, following, outputs), shapes, shape, tracer.captured.recipe())
+
+
+def _other_carry(who: str, found: Sequence[Tensor], given: Sequence[Tensor]) -> str:
+    pairs = [
+        (after, before) for after, before in zip(found, given, strict=False) if not _alike(after, before)
+    ]
+    told = [f"{tuple(b.shape)} {b.dtype} became {tuple(a.shape)} {a.dtype}" for a, b in pairs[:1]]
+    return f"{who} a carry of other shapes or dtypes than it was given{': ' if told else ''}{''.join(told)}"
+
+
+def _alike(one: Tensor, other: Tensor) -> bool:
+    return one.shape == other.shape and one.dtype == other.dtype
 
 
 def _entries(leaf: Any, skip: int) -> int:
@@ -177,7 +190,7 @@ class _TorchFunctions(TorchFunctionMode):
             if chosen:
                 return plain(*args, **kwargs)
         if name in _LEAVES_TORCH and isinstance(args[0], Tensor) and self._traced(args[0]):
-            raise NotLoweredError(f"`Tensor.{name}` takes numbers of a row out of torch")
+            raise NotLoweredError(f"`Tensor.{name}` takes numbers of a row out of torch", name)
         return func(*args, **kwargs)
 
 
@@ -198,5 +211,6 @@ FACTORISATIONS: dict[str, Callable[..., Any]] = {
     "linalg_inv_ex": factorisations.inverse,
     "_linalg_solve_ex": factorisations.solve,
     "linalg_qr": factorisations.orthogonal,
+    "linalg_matrix_exp": matrix_exponential,
     "_linalg_eigh": eigenvalues.eigen,
 }

@@ -25,8 +25,10 @@ from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_mod
 from .captured_tensors import Captured
 from .captured_tensors import tensors as _tensors
 from .graph import FLAG, NARROW, REAL, ROW, WHOLE, WIDE, Graph, Ids
+from .substitutes import instead_of
 
 _OWN = (str(Path(__file__).parent.parent), str(Path(torch.__file__).parent))
+_LINE = 120  # letters of a line of code in the log
 LARGE = 64  # entries above which an operation on a tensor stays a loop over an array in memory
 _READS = ("_local_scalar_dense", "equal", "is_nonzero", "nonzero", "allclose", "masked_select")
 
@@ -35,17 +37,24 @@ _BLANK = ("zeros_like", "ones_like", "full_like", "new_zeros", "new_ones", "new_
 
 
 class NotLoweredError(Exception):
-    """A program that cannot be compiled: the operation, and the line of user code that asked for it."""
+    """A program that cannot be compiled: the operation, the line of user code that asked for it, and what to
+    write in its place.
 
-    def __init__(self, reason: str) -> None:
-        super().__init__(f"{reason}{_where()}")
+    Args:
+        reason: names the operation.
+        name: of it among the `substitutes`.
+    """
+
+    def __init__(self, reason: str, name: str = "") -> None:
+        instead = instead_of(name)
+        super().__init__(f"{reason}{_where()}{'; ' + instead if instead else ''}")
 
 
 def _where() -> str:
     """The innermost line of code outside of torch and this compiler."""
     for frame in reversed(traceback.extract_stack()):
         if not frame.filename.startswith((*_OWN, "<")):
-            return f" at {frame.filename}:{frame.lineno}: {frame.line}"
+            return f" at {frame.filename}:{frame.lineno}: {(frame.line or '')[:_LINE]}"
     return ""
 
 
@@ -85,13 +94,9 @@ class Tracer(TorchDispatchMode):
         if dtype == torch.float32:  # widened: a float32 program whose numbers are carried in double
             return REAL if self.graph.single or self._widened else NARROW
         if dtype.is_complex:
-            raise NotLoweredError(
-                f"{dtype} has no lanes here: write the real and the imaginary part as two real tensors"
-            )
+            raise NotLoweredError(f"{dtype} has no lanes here", "complex")
         if dtype.is_floating_point:
-            raise NotLoweredError(
-                f"{dtype} has no lanes here: compute in float32 or float64, `.float()` or `.to(x.dtype)`"
-            )
+            raise NotLoweredError(f"{dtype} has no lanes here", "half")
         return WHOLE
 
     def attach(self, tensor: Tensor, nodes: Ids) -> Tensor:
@@ -267,13 +272,17 @@ class Tracer(TorchDispatchMode):
             raise NotLoweredError("a derivative with respect to a constant of the program may be wanted")
         name, draws, writes = _facts(func)
         if draws and not _own_generator(args, kwargs):
-            raise NotLoweredError(f"`{func}` draws random numbers")
+            raise NotLoweredError(f"`{func}` draws random numbers", "random")
         if name in _BLANK or not any(self.traced(tensor) for tensor in tensors):
             out = func(*args, **kwargs)
             self.captured.ran(func, args, kwargs, out)
             return out
-        if name in _READS:
-            raise NotLoweredError(f"`{func}` reads a value of a row")
+        masked = name == "index" and any(i is not None and i.dtype == torch.bool for i in args[1])
+        if masked and any(self.traced(i) for i in args[1] if i is not None):
+            reason = "`aten.index` at a mask that the row computes has no scalar form here"
+            raise NotLoweredError(reason, "index")  # also where it takes no entry of this row
+        if name in _READS or (name != "index" and torch.Tag.dynamic_output_shape in func.tags):
+            raise NotLoweredError(f"`{func}` reads a value of a row", name)
         if name in _RESHAPED:
             return func(*args, **kwargs)
         if name.endswith("_") and not name.endswith("__"):

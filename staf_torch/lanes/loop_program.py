@@ -1,0 +1,87 @@
+"""Loops that begin in plain torch: compiled where that repays; a line of the log where they take long."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Callable
+
+from .plain_time import PlainTime
+from .program import Program
+from .row_independence import generators
+from .tree import Tree
+
+_log = logging.getLogger(__name__)
+_GAIN = 2.0  # builds that a loop must take in plain torch before it is compiled
+_SAID, _LONG = 1.5, 3.0  # s after which a loop says that it takes long, and that are then left of it at least
+
+
+class LoopProgram:
+    """Program of a loop that begins in plain torch, and is compiled from its start where that repays.
+
+    The first step is counted as it runs (`plain_time`). Where all of them take twice as long as a compiler,
+    it is undone, random numbers too, and the compiled program runs the loop. Else plain torch goes on, and
+    says in the log after 1.5 s how long the rest takes, if more than 3 s.
+
+    Args:
+        plain: the program in plain torch.
+        compiled: makes the compiled one; None where there is none.
+        times: of the loop, all calls together.
+        remedy: what makes it faster, for the log.
+    """
+
+    def __init__(
+        self, plain: Program, compiled: Callable[[], Program] | None, times: int, *, remedy: str = ""
+    ) -> None:
+        self._step, self._make, self._times, self._remedy = plain.step, compiled, times, remedy
+        self._plain = Program(self._timed, name=plain.name, compile=False)
+        self._compiled: Program | None = None
+        self._done, self._spent, self._fastest, self._said = 0, 0.0, math.inf, False
+
+    def __call__(
+        self, carry: Tree, now: Tree = (), row: Tree = (), *, steps: int | None = None, every: int = 1
+    ) -> tuple[Tree, Tree]:
+        """The carry after the last step, and the outputs, as of a `Program`."""
+        if self._compiled is None:
+            put_back = generators() if not self._done else None
+            try:
+                return self._plain(carry, now, row, steps=steps, every=every)
+            except _RepaysError:
+                assert self._make is not None
+                assert put_back is not None
+                put_back()
+                self._compiled = self._make()
+        return self._compiled(carry, now, row, steps=steps, every=every)
+
+    def _timed(self, carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
+        start = time.perf_counter()
+        if self._make is not None and not self._done:
+            with PlainTime() as plain:
+                found = self._step(carry, now, row)
+            if self._times * plain.seconds() >= _GAIN * plain.build:
+                raise _RepaysError
+        else:
+            found = self._step(carry, now, row)
+        self._look(time.perf_counter() - start)
+        return found
+
+    def _look(self, seconds: float) -> None:
+        """Log once, if a loop takes long, how long the rest of it takes by the fastest step so far."""
+        self._done, self._spent, self._fastest = (
+            self._done + 1,
+            self._spent + seconds,
+            min(self._fastest, seconds),
+        )
+        rest = self._fastest * (self._times - self._done)
+        if self._said or self._done < 2 or self._spent < _SAID or rest < _LONG:
+            return
+        self._said = True
+        _log.warning(
+            "%s: %d of %d steps took %.1f s in plain torch, the rest takes some %.0f s%s",
+            *(self._plain.name, self._done, self._times, self._spent, rest, self._remedy),
+        )
+
+
+class _RepaysError(Exception):
+    """All steps of a loop take longer than a compiler."""

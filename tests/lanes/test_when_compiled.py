@@ -1,0 +1,128 @@
+"""What is compiled by itself is chosen by the work of a call, not by their number, and always alike."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from staf_torch import adp, lanes, systems
+
+pytestmark = pytest.mark.needs_compiler
+COST = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+X0 = torch.tensor([[0.3, 0.1]], dtype=torch.float64)
+
+
+class Chain(systems.ControlAffineSystem):
+    """A plant whose drift takes many small operations; it counts its calls."""
+
+    dim, inputs = 2, 1
+
+    def __init__(self, links: int) -> None:
+        super().__init__()
+        self.links, self.calls = links, list[int]()
+
+    def drift(self, x: Tensor) -> Tensor:
+        self.calls.append(len(x))
+        force = lanes.repeat(self.links, lambda f: 0.99 * f.sin(), -x[..., 0])
+        return torch.stack((x[..., 1], force - x[..., 1]), dim=-1)
+
+    def effectiveness(self, x: Tensor) -> Tensor:
+        return torch.tensor([[0.0], [1.0]]).to(x).expand(*x.shape, 1)
+
+
+def run(plant: systems.ControlAffineSystem, steps: int, **more: object) -> tuple[adp.LoopResult, int]:
+    plant.calls.clear()
+    found = adp.simulate(lambda x: -x[..., 1:], plant, COST, X0, dt=0.01, steps=steps, **more)
+    return found, len(plant.calls)
+
+
+@pytest.mark.parametrize(("links", "steps", "compiled"), [(3, 60, False), (600, 200, True), (600, 5, False)])
+def test_a_loop_is_compiled_where_its_operations_take_longer_than_a_compiler(
+    links: int, steps: int, compiled: bool
+) -> None:
+    """Case 16 of FIELD.md: 200 steps of a costly plant, and not 60 of a cheap one or 5 of it."""
+    found, calls = run(Chain(links), steps)
+    assert (calls < 4 * steps) is compiled  # plain torch calls a plant four times a step
+    assert torch.equal(found.state, run(Chain(links), steps, compile=compiled)[0].state)  # from the start
+
+
+def test_a_trajectory_of_a_costly_plant_is_compiled() -> None:
+    plant = Chain(600)
+    found = systems.simulate(plant, X0, dt=0.01, steps=200)
+    assert len(plant.calls) < 200
+    with lanes.compiling("never"):
+        torch.testing.assert_close(systems.simulate(plant, X0, dt=0.01, steps=20), found[:, :21])
+
+
+class Enough(Exception):  # noqa: N818
+    """A test has seen what it was to see."""
+
+
+class Noisy(Chain):
+    drawn: list[float]
+    wanted: list[float]
+
+    def drift(self, x: Tensor) -> Tensor:
+        self.drawn.append(torch.rand(()).item() if x.any() else 0.0)
+        if self.wanted and self.drawn[-len(self.wanted) :] == self.wanted:
+            raise Enough
+        return super().drift(x) * (1 + self.drawn[-1])
+
+
+def test_a_loop_that_cannot_be_compiled_draws_what_it_draws_in_plain_torch() -> None:
+    """Its first step was counted and undone."""
+    plant = Noisy(1000)
+    plant.drawn, plant.wanted = [], []
+    torch.manual_seed(3)
+    run(plant, 3, compile=False)
+    plant.drawn, plant.wanted = [], plant.drawn[-12:]
+    torch.manual_seed(3)
+    with pytest.raises(Enough):
+        run(plant, 200)
+    assert len(plant.drawn) >= 4 + 12  # of the step that was undone, and of those that count
+
+
+class Costly(nn.Module):
+    def __init__(self, links: int) -> None:
+        super().__init__()
+        self.links = links
+
+    @lanes.compiled("a costly function")
+    def forward(self, x: Tensor) -> Tensor:
+        return lanes.repeat(self.links, lambda x: 0.99 * x + 0.01, x)
+
+
+@pytest.mark.parametrize(("links", "least", "most"), [(1, 100, 101), (5000, 30, 60)])
+def test_a_function_is_compiled_once_its_calls_took_as_long_as_a_compiler(
+    links: int, least: int, most: int
+) -> None:
+    function, calls = Costly(links), 0
+    while not function.forward.compiled and calls <= most:
+        function(X0)
+        calls += 1
+    assert least <= calls <= most
+
+
+def test_a_slow_plant_that_is_no_torch_says_within_two_seconds_how_long_it_takes(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    calls = 0
+
+    def step(x: object, u: object) -> object:
+        nonlocal calls
+        calls += 1
+        if caplog.messages:
+            raise Enough
+        time.sleep(0.3 if calls > 8 else 0.0)
+        return 0.9 * np.asarray(x) + 0.1 * np.asarray(u)
+
+    plant = systems.StepPlant(step, dim=2, inputs=1, dt=0.01)
+    with pytest.raises(Enough):
+        adp.simulate(lambda x: -x[..., 1:], plant, COST, X0, steps=1000)
+    (line,) = caplog.messages
+    assert "1000 steps took" in line
+    assert "a plant that is no torch is called at every step" in line
