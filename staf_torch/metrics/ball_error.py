@@ -88,8 +88,8 @@ class StateErrorPass:
         width = self._points * self._basis.count
         times = max(1, _BLOCK // (width * max(1, x.numel() // x.shape[-1] // x.shape[-2])))
         blocks = zip(*(part.split(times, dim=-2) for part in (x, coefficients, ideal)), strict=True)
-        found = [self._counted(next(blocks)), *(self._at(*block) for block in blocks)]
-        columns = zip(*found, strict=True)
+        errors = [self._counted(next(blocks)), *(self._at(*block) for block in blocks)]
+        columns = zip(*errors, strict=True)
         return StateErrors(*(torch.cat(column, dim=-1) for column in columns))
 
     def _pays(self) -> bool:

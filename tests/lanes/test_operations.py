@@ -86,7 +86,7 @@ OPERATIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "a scaled product": lambda x: torch.addmm(x, x, matrix(torch.ones_like(x))[0], beta=0.5, alpha=2),
     "rsub": lambda x: torch.rsub(x, x.flip(-1), alpha=2),
     "matrix exponential": lambda x: torch.linalg.matrix_exp(matrix(3 * x)),
-    "its slope": slope(lambda x: torch.linalg.matrix_exp(matrix(x.tanh()))),
+    "its slope": slope(lambda x: torch.linalg.matrix_exp(matrix(x.tanh()) / 4)),
     "round to decimals": lambda x: torch.round(x, decimals=2),
     "sort": lambda x: x.sort(-1)[0],
     "argsort": lambda x: x.argsort(dim=-1, stable=True).to(x),

@@ -193,6 +193,10 @@ def simulate(
     loop.to(x0.device)
     if isinstance(controller, Feedback) and x0.device.type != "cpu":
         controller.check(x0)
+    if compile is True and not system.traceable:
+        _log.warning(
+            "the closed loop runs in plain torch, slower: its plant is no torch (NumPy, a simulator)"
+        )
     whole = _Run(x0, steps, every, _seeds(seed, len(x0)), compile, progress)
     with torch.no_grad():
         result, last = whole.of(loop)

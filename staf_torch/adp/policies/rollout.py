@@ -206,7 +206,10 @@ class _TwoPrograms:
         one = self._one.get(key)
         if one is not None:  # the plans read where the numbers are, and not in which shape
             u, roll, improve = one
-            return improve((x, roll((x, u))[0]))[0]
+            if roll.direct and improve.direct:
+                return improve((x, roll((x, u))[0]))[0]
+            at = x.reshape(1, -1)  # of another dtype than the program's: what is copied needs its shape
+            return improve((at, roll((at.expand(len(u), -1), u))[0].view(1, len(u))))[0]
         rows = x if x.dim() == 2 else x.unsqueeze(0)
         (batch, dim), u = rows.shape, self._directions.to(x)
         count = len(u)
@@ -216,7 +219,7 @@ class _TwoPrograms:
             return self._improve(rows, self._roll(at, u).view(batch, count))
         first, values = self._roll.planned(rows.expand(count, dim), u)
         second, found = self._improve.planned(rows, values.view(1, count))
-        if first is not None and second is not None and first.direct and second.direct:
+        if first is not None and second is not None:
             if len(self._one) >= _KEPT:
                 self._one.clear()
             self._one[key] = u, first, second
