@@ -23,7 +23,7 @@ from ..lanes.trace.graph import WIDE
 from ..lanes.trace.step import trace
 from ..lanes.trace.tracer import NotLoweredError
 from ..lanes.tree import Tree
-from .controllers import check_bounded
+from .controllers import check_bounded, in_dtype
 from .formats import Run, as_tuple
 from .remembered import RememberedPolicy
 from .sheet import Latency, Work
@@ -113,6 +113,7 @@ def export_learning_c(controller: Controller, x0: Tensor, path: Path, *, dt: flo
         ValueError: if the controller optimises on the way, or an operation of it has no C here.
     """
     check_bounded("export_learning_c", controller)
+    controller = in_dtype(controller, x0.dtype)
     carry = controller.init(x0[:1])
     inputs = {"x": x0[:1]}
     if controller.draws:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import copy
+import gc
+from types import FunctionType, ModuleType
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -23,6 +26,8 @@ from ..adp.planning.receding_horizon import StrainedPlans
 from ..adp.planning.shooting.optimum import PlanReplay
 from ..numerics.checks import fail, hold, trailing
 from .remembered import RememberedPolicy
+
+Some = TypeVar("Some")
 
 
 class ActorPolicy(nn.Module):
@@ -257,3 +262,26 @@ def check_bounded(call: str, controller: Controller) -> None:
     if isinstance(controller, PlanReplay):
         rule = "must be a feedback: a plan of direct shooting knows no state; `RecedingHorizon` follows one"
         raise fail(call, "controller", rule, "PlanReplay")
+
+
+def in_dtype(thing: Some, dtype: torch.dtype) -> Some:
+    """Return a copy in which every floating-point tensor has a dtype: those of plain objects and tuples,
+    which `Module.to` leaves as they are, too. What a function of the user captured stays."""
+    if dtype == torch.float64:
+        return copy.deepcopy(thing)
+    memo: dict[int, Any] = {}
+    seen, waiting = {id(thing)}, [thing]
+    while waiting:
+        here = waiting.pop()
+        if isinstance(here, Tensor):
+            if here.is_floating_point():
+                changed = here.detach().to(dtype)
+                memo[id(here)] = nn.Parameter(changed) if isinstance(here, nn.Parameter) else changed
+            continue
+        if isinstance(here, type | ModuleType | FunctionType):
+            continue
+        for each in gc.get_referents(here):
+            if id(each) not in seen:
+                seen.add(id(each))
+                waiting.append(each)
+    return copy.deepcopy(thing, memo)

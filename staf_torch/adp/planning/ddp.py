@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from ...lanes import Program, repeat, scan, traced_as
+from ...lanes.tree import Tree
 from ...numerics.box import minimum_and_slopes
 from ...numerics.checks import fail, integer, positive_real, trailing
 from ...numerics.riccati import riccati_step
@@ -92,11 +93,7 @@ class BoxDDP:
         self.steps = integer("BoxDDP", "steps", steps, least=1)
         self.iterations = integer("BoxDDP", "iterations", iterations, least=1)
         self.tolerance = positive_real("BoxDDP", "tolerance", tolerance)
-        self._expand = Program(
-            lambda carry, now, row: (carry, tuple(problem.derivatives(*row))),
-            name="derivatives of a step",
-            compile=compile,
-        )
+        self._expand = Program(self.expand, name="derivatives of a step", compile=compile)
         self._back = Program(self.backward, name="a backward pass", compile=compile)
         self._forth = Program(self.forward, name="a forward pass", compile=compile)
 
@@ -288,6 +285,10 @@ class BoxDDP:
         u = self.problem.admissible(u)
         after, paid = self.problem.advance(x, u)
         return after, (x, u, paid)
+
+    def expand(self, carry: Tree, _: Tree, row: tuple[Tensor, ...]) -> tuple[Tree, tuple[Tensor, ...]]:
+        """Return the derivatives of a step, as the step of a row program."""
+        return carry, tuple(self.problem.derivatives(*row))
 
     def _derivatives(self, plan: SearchState) -> Derivatives:
         """Along the trajectories: (B, T, ...)."""

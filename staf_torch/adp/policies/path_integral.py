@@ -9,11 +9,12 @@ import torch
 from torch import Tensor
 
 from ...lanes import Program, scan
+from ...lanes.tree import Tree
 from ...numerics.checks import fail, integer, one_or_each, positive, positive_real
 from ..loop.controller import Controller
 from ..problem.sampled import SampledProblem
 
-_INSIDE = 1 - 1e-12  # of a uniform number: its normal one is then finite
+_OUTSIDE = 1e-12  # share of a uniform number that is left away: its normal one is then finite
 _NOISE = 0.5  # standard deviation, of the range of an input
 _FINEST = 0.01  # share of the noise that the last sample has
 
@@ -95,9 +96,7 @@ class PathIntegral(Controller):
         self.register_buffer("scales", scales)  # (S,)
         self.scales: Tensor
         self.draws = -(-self.samples * self.knots * m // n)
-        self._roll = Program(
-            lambda carry, now, row: (carry, self._paid(*row)), name="sampled plans", compile=compile
-        )
+        self._roll = Program(self._rolled, name="sampled plans", compile=compile)
 
     def init(self, x0: Tensor) -> Tensor:
         """No change of the feedback, (B, T, m)."""
@@ -108,7 +107,8 @@ class PathIntegral(Controller):
         count, m = len(x), self.problem.inputs
         plan = carried.unsqueeze(1)
         numbers = uniform.flatten(1)[:, : self.samples * self.knots * m]
-        normal = math.sqrt(2) * (_INSIDE * numbers).erfinv().view(count, self.samples, self.knots, m)
+        inside = 1 - max(_OUTSIDE, torch.finfo(x.dtype).eps)
+        normal = math.sqrt(2) * (inside * numbers).erfinv().view(count, self.samples, self.knots, m)
         tried = plan + (self.spread @ normal) * self.scales[:, None, None] * self.noise  # (B, S, T, m)
         tried[:, 0], tried[:, 1] = plan[:, 0], 0.0
         cost = self.costs(x, tried)
@@ -116,9 +116,8 @@ class PathIntegral(Controller):
         fine = torch.isfinite(cost)
         excess = torch.where(fine, cost - least, 0.0)
         mean = excess.sum(1, keepdim=True) / fine.sum(1, keepdim=True)
-        sharp = excess / (self.temperature * mean).clamp(
-            min=1e-300
-        )  # all samples cost the same: equal weights
+        least_mean = torch.finfo(mean.dtype).tiny  # all samples cost the same: equal weights
+        sharp = excess / (self.temperature * mean).clamp(min=least_mean)
         weight = torch.where(fine, (-sharp).exp(), 0.0)
         blended = (weight[..., None, None] * torch.where(fine[..., None, None], tried, 0.0)).sum(1)
         blended = blended / weight.sum(1)[:, None, None]
@@ -132,6 +131,10 @@ class PathIntegral(Controller):
         """Return the costs of changes of the feedback, inf if not finite: (B, n), (B, S, T, m) -> (B, S)."""
         cost = self._roll.over((change,), (x,))
         return torch.where(torch.isfinite(cost), cost, torch.inf)
+
+    def _rolled(self, carry: Tree, _: Tree, row: tuple[Tensor, Tensor]) -> tuple[Tree, Tensor]:
+        """`_paid` as the step of a row program."""
+        return carry, self._paid(*row)
 
     def _paid(self, x: Tensor, change: Tensor) -> Tensor:
         """Return the cost of a change of the feedback, a row each: (R, n), (R, T, m) -> (R,)."""

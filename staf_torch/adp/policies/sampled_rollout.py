@@ -161,9 +161,9 @@ class SampledRollout(nn.Module):
         else:
             reach = slopes.square().sum(-1).sqrt()  # |B_j|, (..., m)
             units = slopes / torch.where(reach > 0, reach, 1.0).unsqueeze(-1)
-            away = (self.along.places.unsqueeze(-1) * units.unsqueeze(-3)).sum(-2)  # (..., M, n)
+            away = (self.along.places.to(x).unsqueeze(-1) * units.unsqueeze(-3)).sum(-2)  # (..., M, n)
             known = self.rollout(after.unsqueeze(-2) + away)
-            steep = reach * matvec(self.along.weights, known.whole)
+            steep = reach * matvec(self.along.weights.to(x), known.whole)
         pull = rise + self._discount() * steep
         weighted = (slopes.unsqueeze(-2) * self.metric.to(x)).sum(-1)  # B'P, (..., m, n)
         bent = (weighted.unsqueeze(-2) * slopes.unsqueeze(-3)).sum(-1)  # B'P B, (..., m, m)

@@ -65,11 +65,10 @@ class _ScalarWriter(StatementWriter):
     def _number(self, value: float | bool, type: str) -> str:
         if isinstance(value, bool):
             return str(int(value))
-        if math.isnan(value):
-            return "NAN"
-        if math.isinf(value):
-            return "INFINITY" if value > 0 else "(-INFINITY)"
         narrow = self.graph.single and type != WIDE
+        if not math.isfinite(value):  # the macros are float, whatever stands beside them
+            text = ("" if narrow else "(double)") + ("NAN" if math.isnan(value) else "INFINITY")
+            return f"(-{text})" if value < 0 else text
         text = f"{value:.9g}" if narrow else repr(value)
         text += ("" if any(c in text for c in ".e") else ".0") + ("f" if narrow else "")
         return f"({text})" if math.copysign(1.0, value) < 0 else text
