@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import logging
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -16,13 +15,18 @@ from torch import Tensor
 
 from .. import __version__
 from ..deploy import c_header, export_learning_c, formats, sheet, trace
+from ..deploy.counted import counted
+from ..deploy.names import made_name
+from ..deploy.onnx_loops import with_loops
 from ..deploy.sheet import Port
+from ..lanes.emit.identifiers import checked_names
 from ..numerics.checks import choice, fail
 from ..results.files import write_text
 from ..results.untrusted import visible
 from ..settings.chase import DTYPES
 from .deployable import Deployable, Learner, deployable, learning
 
+_PORTS = ("state", "control", "value", "gradient", "x", "u", "uniform")  # names of inputs and outputs
 ENDINGS = {"onnx": ".onnx", "pt2": ".pt2", "aoti": ".aoti.pt2", "c": ".h"}
 _RUNTIMES = {"onnx": "onnxruntime", "pt2": "eager torch", "aoti": "AOTInductor", "c": "C by ctypes"}
 _NEEDS: dict[str, Callable[[], object]] = {
@@ -43,6 +47,7 @@ def export(
     batch: int | None = None,
     calls: int = sheet.CALLS,
     trust: bool = False,
+    name: str | None = None,
 ) -> dict[str, Any]:
     """Write the file and its sheet (the same name with .json and .md), and return the sheet.
 
@@ -55,6 +60,7 @@ def export(
         batch: rows of every call; any by default.
         calls: that the latency is the worst of.
         trust: as in `deployable`.
+        name: of the C function or the graph; that of the run's folder by default.
 
     Raises:
         ValueError: if an argument breaks its rule, an extra or a compiler is missing, the run cannot be
@@ -63,17 +69,17 @@ def export(
     choice("staf-export", "to", to, tuple(ENDINGS))
     choice("staf-export", "dtype", dtype, tuple(DTYPES))
     _NEEDS.get(to, lambda: None)()
+    name = _called(name, run, row)
     if to == "c":
         batch = 1
     found = deployable(run, row, trust=trust)
     path = _file(run, output, f"{found.kind}{ENDINGS[to]}")
     module = found.module(DTYPES[dtype])
-    origin: dict[str, object] = {"run": str(run), "row": row}
+    origin: dict[str, object] = {"run": str(run), "row": row, "name": name}
     if to == "c":
         call, work = _write_c(module, path, found, origin, DTYPES[dtype])
     else:
-        program = trace(module, found.points.to(DTYPES[dtype]), batch=batch)
-        call, work = _write(program, path, to, found, origin), sheet.work(program)
+        call, work = _write(module, path, to, found, origin, DTYPES[dtype], batch)
     facts = _measure(call, module, found, dtype, batch, calls)
     ends = {"to": to, "dtype": dtype, "batch": "any" if batch is None else batch}
     ports = {"inputs": (found.input,), "outputs": found.outputs}
@@ -88,6 +94,7 @@ def export_learning(
     row: int = 0,
     calls: int = sheet.CALLS,
     trust: bool = False,
+    name: str | None = None,
 ) -> dict[str, Any]:
     """Write a C header of a controller that goes on learning and its sheet, and return the sheet.
 
@@ -95,19 +102,20 @@ def export_learning(
     random numbers give the same controls.
 
     Args:
-        run, dtype, output, row, calls, trust: as in `export`.
+        run, dtype, output, row, calls, trust, name: as in `export`; the default name ends with ``_learner``.
 
     Raises:
         ValueError: as `export`.
     """
     choice("staf-export", "dtype", dtype, tuple(DTYPES))
     c_header.need_c_compiler()
+    name = _called(name, run, row, "_learner")
     found, real = learning(run, row, trust=trust), DTYPES[dtype]
     path = _file(run, output, "learner.h")
-    origin: dict[str, object] = {"run": str(run), "row": row}
+    origin: dict[str, object] = {"run": str(run), "row": row, "name": name}
     note = f"{found.what}\nFrom {run}, trajectory {row}, staf_torch {__version__}."
     states, uniform = found.states.to(real), found.uniform.to(real)
-    made = export_learning_c(found.copied(real), states[:1], path, dt=found.dt, note=note)
+    made = export_learning_c(found.copied(real), states[:1], path, dt=found.dt, name=name, note=note)
     device = c_header.runner_learning_c(path, found.controller.draws, int(found.outputs[0].size or 1), real)
     exact, rough = _followed(found, torch.float64), _followed(found, torch.float32)
     wanted = exact if real == torch.float64 else rough
@@ -131,6 +139,15 @@ def _followed(found: Learner, dtype: torch.dtype) -> Tensor:
             u, carried = controller.step(x, carried, numbers, found.dt)
             controls.append(u)
     return torch.cat(controls)
+
+
+def _called(name: str | None, run: Path, row: int, end: str = "") -> str:
+    """Return the name in the file: as given, else of the run's folder and the trajectory."""
+    if name is None:
+        made = made_name(run.resolve().name, "run") + (f"_{row}" if row else "") + end
+        return f"{made}_run" if made in _PORTS else made
+    checked_names("staf-export", "name", [name], _PORTS)
+    return name
 
 
 def _file(run: Path, output: Path | None, name: str) -> Path:
@@ -175,18 +192,30 @@ def _page(
 
 
 def _write(
-    program: torch.export.ExportedProgram, path: Path, to: str, found: Deployable, origin: dict[str, object]
-) -> formats.Run:
-    names = [port.name for port in found.outputs]
+    module: torch.nn.Module,
+    path: Path,
+    to: str,
+    found: Deployable,
+    origin: dict[str, object],
+    dtype: torch.dtype,
+    batch: int | None,
+) -> tuple[formats.Run, sheet.Work]:
+    names, name, example = [port.name for port in found.outputs], str(origin["name"]), found.points.to(dtype)
     if to == "onnx":
-        formats.export_onnx(program, path, [found.input.name], names)
-        return formats.runner_onnx(path)
+        loops = with_loops(module, example)
+        program = module if loops is not None else trace(module, example, batch=batch)
+        given = {"example": example, "batch": batch} if loops is not None else {}
+        formats.export_onnx(program, path, [found.input.name], names, name=name, **given)
+        entries = example.shape[1] + sum(port.size or 1 for port in found.outputs)
+        work = sheet.work(program) if loops is None else counted(loops).work(entries, dtype)
+        return formats.runner_onnx(path), work
+    program = trace(module, example, batch=batch)
     if to == "pt2":
         ports = {"input": dataclasses.asdict(found.input), "outputs": names, "what": found.what}
         formats.export_program(program, path, {"version": __version__, **origin, **ports})
-        return formats.runner_program(path)
+        return formats.runner_program(path), sheet.work(program)
     formats.export_package(program, path)
-    return formats.runner_package(path)
+    return formats.runner_package(path), sheet.work(program)
 
 
 def _write_c(
@@ -195,7 +224,7 @@ def _write_c(
     names, sizes = [port.name for port in found.outputs], [port.size for port in found.outputs]
     note = f"{found.what}\nFrom {origin['run']}, trajectory {origin['row']}, staf_torch {__version__}."
     example = found.points.to(dtype)
-    made = c_header.export_c(module, example, path, names, note=note)
+    made = c_header.export_c(module, example, path, names, name=str(origin["name"]), note=note)
     entries = example.shape[1] + sum(size or 1 for size in sizes)
     return c_header.runner_c(path, sizes, dtype), made.work(entries, dtype)
 
@@ -239,6 +268,7 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument(
         "--learning", action="store_true", help="with --to c: the controller goes on learning, from time 0"
     )
+    found.add_argument("--name", help="of the C function or the graph; the run's folder by default")
     found.add_argument("--trust", action="store_true", help="import code of your own that the settings name")
     return found
 
@@ -246,8 +276,6 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: list[str] | None = None) -> None:
     """Run the command. What a user got wrong ends as one sentence and the exit code 1."""
     given = vars(parser().parse_args(arguments))
-    # The exporter warns that torchvision is not there, for operators that nothing here has.
-    logging.getLogger("torch.onnx._internal.exporter._registration").setLevel(logging.ERROR)
     try:
         if not given.pop("learning"):
             page = export(**given)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import ctypes
-import math
 import os
+import re
 import shutil
 import subprocess
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -18,42 +17,32 @@ from torch import Tensor, nn
 from ..adp import Controller
 from ..lanes import Program
 from ..lanes.call import Given
-from ..lanes.emit.schedule import Schedule
+from ..lanes.emit.identifiers import checked_names
 from ..lanes.trace.graph import WIDE
 from ..lanes.trace.step import trace
 from ..lanes.trace.tracer import NotLoweredError
-from ..lanes.tree import Tree
+from ..lanes.tree import Tree, flatten, labels
+from ..numerics.checks import fail
 from .controllers import check_bounded, in_dtype
+from .counted import Source, counted
 from .formats import Run, as_tuple
+from .names import check_count, check_dtype, function_name, listed_names
 from .remembered import RememberedPolicy
-from .sheet import Latency, Work
-
-_CHEAP = set("add sub mul div lt le eq ne and or xor neg abs min max not where sqrt".split())  # noqa: SIM905
-_FREE = set("const elem result collect carry state row now load pack cast loop".split())  # noqa: SIM905
-
-
-class Source(NamedTuple):
-    """Cost of a call of a header."""
-
-    constants: int  # numbers in it
-    flops: int
-    functions: int  # calls of exp and the like
-
-    def work(self, entries: int, dtype: torch.dtype) -> Work:
-        """Return the cost in the words of `staf-export`.
-
-        Args:
-            entries: of all inputs and outputs.
-            dtype: of the arithmetic.
-        """
-        size = dtype.itemsize
-        return Work(self.constants, self.flops, self.functions, self.constants * size, entries * size)
+from .sheet import Latency
 
 
 def export_c(
-    module: nn.Module, example: Tensor, path: Path, outputs: Sequence[str], *, note: str = ""
+    module: nn.Module,
+    example: Tensor,
+    path: Path,
+    outputs: Sequence[str],
+    *,
+    name: str | None = None,
+    note: str = "",
 ) -> Source:
-    """Write a module at one row as ``static inline void staf(const T state[n], T value[...], ...)``.
+    """Write a module at one row as ``static inline void NAME(const T state[n], T value[...], ...)``.
+
+    Headers of different names go into one program, in C99 and in C++; two of one name are an error there.
 
     Example:
         >>> plant = systems.TwoState()
@@ -69,23 +58,32 @@ def export_c(
         module: (1, n) -> a tensor or a tuple of tensors (1, ...).
         example: an input (1, n); float64 makes T double, float32 float.
         path: of the header.
-        outputs: the names of the outputs.
+        outputs: the names of the outputs, free in C and C++ (`exp` and `class` are not).
+        name: of the function, and before whatever else the header defines; that of the policy by default
+            (`lqr`, `near_optimal`).
         note: lines for the comment at its head.
 
     Raises:
-        ValueError: if an operation of the module has no C here.
+        ValueError: if a name is taken, or given twice, their number is wrong, or an operation of the module
+            has no C here.
     """
-
+    outputs = listed_names("export_c", outputs)
+    name = function_name("export_c", name, module, ["state", *outputs])
+    checked_names("export_c", "outputs", outputs, ["state"])
+    check_dtype("export_c", module, example)
     if isinstance(module, RememberedPolicy):
-        return _write_remembered(path, module, example[:1], outputs, note)
+        check_count("export_c", outputs, 1)
+        return _write_remembered(path, module, example[:1], name, outputs, note)
     program = Program(lambda carry, now, row: (carry, as_tuple(module(row["state"]))), name="the header")
-    return _write(path, program, (), {"state": example[:1]}, outputs, note)
+    return _write(path, program, (), {"state": example[:1]}, name, outputs, note)
 
 
-def export_learning_c(controller: Controller, x0: Tensor, path: Path, *, dt: float, note: str = "") -> Source:
-    """Write a controller that learns: a structure ``staf_state``, ``staf_start`` that fills it, and
+def export_learning_c(
+    controller: Controller, x0: Tensor, path: Path, *, dt: float, name: str | None = None, note: str = ""
+) -> Source:
+    """Write a controller that learns: a structure ``NAME_state``, ``NAME_start`` that fills it, and
 
-        static inline void staf(staf_state *state, const T x[n], const T uniform[...], T u[m]);
+        static inline void NAME(NAME_state *state, const T x[n], const T uniform[...], T u[m]);
 
     which returns the control to hold for ``dt`` seconds and moves the weights. ``uniform`` are random numbers
     of [-1, 1] that the caller draws; the argument is missing where the controller needs none.
@@ -107,14 +105,18 @@ def export_learning_c(controller: Controller, x0: Tensor, path: Path, *, dt: flo
         x0: the first state, (1, n); float64 makes T double, float32 float.
         path: of the header.
         dt: s.
+        name: as in `export_c`; that of the controller by default.
         note: lines for the comment at its head.
 
     Raises:
-        ValueError: if the controller optimises on the way, or an operation of it has no C here.
+        ValueError: if the controller optimises on the way, the name is taken, or an operation has no C here.
     """
+    name = function_name("export_learning_c", name, controller, ["state", "x", "uniform", "u"])
     check_bounded("export_learning_c", controller)
     controller = in_dtype(controller, x0.dtype)
     carry = controller.init(x0[:1])
+    fields = labels(flatten(carry)[1], "carry")
+    checked_names("export_learning_c", "controller", fields, field=True)  # what its state is made of
     inputs = {"x": x0[:1]}
     if controller.draws:
         inputs["uniform"] = x0.new_zeros(1, controller.draws, x0.shape[-1])
@@ -124,52 +126,43 @@ def export_learning_c(controller: Controller, x0: Tensor, path: Path, *, dt: flo
         u, after = controller.step(row["x"], carry, uniform, dt)
         return after, (u,)
 
-    return _write(path, Program(step, name="the header"), carry, inputs, ["u"], note)
+    return _write(path, Program(step, name="the header"), carry, inputs, name, ["u"], note)
 
 
-def _write(path: Path, program: Program, carry: Tree, row: Tree, outputs: Sequence[str], note: str) -> Source:
-    source = _counted(program, carry, row)
-    text = program.c_source("staf", carry, (), row, outputs=outputs, note=_said(note, source, "takes"))
+def _write(
+    path: Path, program: Program, carry: Tree, row: Tree, name: str, outputs: Sequence[str], note: str
+) -> Source:
+    source, count = _counted(program, carry, row)
+    check_count("export_c", outputs, count)
+    text = program.c_source(name, carry, (), row, outputs=outputs, note=_said(note, source, "takes"))
     path.write_text(text, encoding="utf-8")
     return source
 
 
 def _write_remembered(
-    path: Path, module: RememberedPolicy, x: Tensor, outputs: Sequence[str], note: str
+    path: Path, module: RememberedPolicy, x: Tensor, name: str, outputs: Sequence[str], note: str
 ) -> Source:
     program, row, names = module.program(), module.row(x), ["cost", "control"]
-    one = _counted(program, (), row)
+    one, _ = _counted(program, (), row)
     plans, (searched, n) = module.candidates + 1, module.searched.shape
     compared = searched * (3 * n + 1) + n * (2 * n + 4)
     tables = sum(getattr(module, name).numel() for name in ("plans", "models", "searched"))
     whole = Source(tables + one.constants, plans * one.flops + compared, plans * one.functions)
-    follow = program.c_source("staf_follow", (), (), row, outputs=names)
+    follow = program.c_source(f"{name}_follow", (), (), row, outputs=names)
     said = _said(note, whole, f"compares {searched} states and takes at most")
-    path.write_text(module.c_text(follow, outputs, said), encoding="utf-8")
+    path.write_text(module.c_text(name, follow, outputs, said), encoding="utf-8")
     return whole
 
 
-def _counted(program: Program, carry: Tree, row: Tree) -> Source:
+def _counted(program: Program, carry: Tree, row: Tree) -> tuple[Source, int]:
+    """Return what a call costs, and the number of outputs."""
     try:
-        graph, _, following, ends = trace(program.step, Given.of(carry, (), row, 1), folded=True).program
+        traced = trace(program.step, Given.of(carry, (), row, 1), folded=True)
     except NotLoweredError as error:
         raise ValueError(f"This has no C here, export it as ONNX, pt2 or aoti: {error}") from error
-    if graph.single and WIDE in graph.type:
+    if traced.program[0].single and WIDE in traced.program[0].type:
         raise ValueError("This needs float64 inside, or float32 loses its digits: use --dtype float64.")
-    schedule = Schedule(graph, following, ends)
-    constants = flops = functions = 0
-    for node in schedule.live:
-        op, count = graph.op[node], schedule.repeats(node)
-        constants += op == "const"
-        if op in ("map", "dot"):
-            aux = graph.aux[node]
-            count *= math.prod(aux[1]) if op == "map" else 2 * aux[0] * aux[1]
-            op = aux[0] if op == "map" else "add"
-        if op in _CHEAP:
-            flops += count
-        elif op not in _FREE:
-            functions += count
-    return Source(constants, flops, functions)
+    return counted(traced), len(traced.outputs)
 
 
 def _said(note: str, source: Source, takes: str) -> str:
@@ -192,7 +185,7 @@ def runner_c(path: Path, sizes: Sequence[int | None], dtype: torch.dtype) -> Run
     kind = _c_type(dtype)
     names = ", ".join(f"o{k}" for k in range(len(sizes)))
     declared = ", ".join(f"{kind} *o{k}" for k in range(len(sizes)))
-    call = _built(path, f"void call(const {kind} *state, {declared}) {{ staf(state, {names}); }}")
+    call = _built(path, f"void call(const {kind} *state, {declared}) {{ {_name(path)}(state, {names}); }}")
 
     def run(x: Tensor) -> tuple[Tensor, ...]:
         outs = tuple(torch.empty(len(x), *([] if size is None else [size]), dtype=dtype) for size in sizes)
@@ -228,13 +221,13 @@ def time_c(path: Path, states: Tensor, outputs: Sequence[int]) -> Latency:
     Raises:
         ValueError: if there is no C compiler.
     """
-    kind = _c_type(states.dtype)
+    kind, name = _c_type(states.dtype), _name(path)
     declared = " ".join(f"{kind} o{k}[{size}];" for k, size in enumerate(outputs))
     names = ", ".join(f"o{k}" for k in range(len(outputs)))
     used = " ".join(f"seen += o{k}[0];" for k in range(len(outputs)))
     now = "clock_gettime(CLOCK_THREAD_CPUTIME_ID, &%s);"
     loop = (
-        f"for (long r = 0; r < rows; ++r) {{ {now % 'a'} staf(x + r * n, {names}); {now % 'b'} {used} "
+        f"for (long r = 0; r < rows; ++r) {{ {now % 'a'} {name}(x + r * n, {names}); {now % 'b'} {used} "
         "us[r] = 1e6 * (double)(b.tv_sec - a.tv_sec) + 1e-3 * (double)(b.tv_nsec - a.tv_nsec); }"
     )
     body = f"struct timespec a, b; volatile double seen = 0; {declared} {loop}"
@@ -262,9 +255,9 @@ def runner_learning_c(
     Raises:
         ValueError: if there is no C compiler.
     """
-    kind = _c_type(dtype)
-    step = f"staf(&s, x + k * n, {f'z + k * n * {draws}, ' if draws else ''}u + k * {inputs})"
-    loop = f"staf_state s; staf_start(&s); for (long k = 0; k < steps; ++k) {step}; (void)z;"
+    kind, name = _c_type(dtype), _name(path)
+    step = f"{name}(&s, x + k * n, {f'z + k * n * {draws}, ' if draws else ''}u + k * {inputs})"
+    loop = f"{name}_state s; {name}_start(&s); for (long k = 0; k < steps; ++k) {step}; (void)z;"
     given = f"const {kind} *x, const {kind} *z, {kind} *u, long steps, long n"
     call = _built(path, f"void call({given}) {{ {loop} }}")
 
@@ -274,6 +267,18 @@ def runner_learning_c(
         return u
 
     return run
+
+
+def _name(path: Path) -> str:
+    """Return the name of the function of a header, the last one that it defines.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    found = re.findall(r"^static inline void (\w+)\(", path.read_text(encoding="utf-8"), re.MULTILINE)
+    if not found:
+        raise fail("time_c", "path", "must be a header of export_c", str(path))
+    return str(found[-1])
 
 
 def _c_type(dtype: torch.dtype) -> str:

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import logging
 import os
 import shutil
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.export import ExportedProgram
 
-from ..numerics.checks import fail
+from ..numerics.checks import fail, integer, trailing
+from .graph import trace
+from .names import check_count, check_dtype, function_name, listed_names
+from .onnx_loops import in_loops, renamed, with_loops
 
 FORMAT = 1
 """Of the note inside a .pt2 file; raised when an older reader would go wrong."""
@@ -51,34 +56,97 @@ def need_compiler() -> None:
         )
 
 
-def export_onnx(program: ExportedProgram, path: Path, inputs: list[str], outputs: list[str]) -> None:
-    """Write a program of `trace` as an ONNX model.
+def export_onnx(
+    program: ExportedProgram | nn.Module,
+    path: Path,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    *,
+    example: Tensor | None = None,
+    batch: int | None = None,
+    name: str | None = None,
+) -> None:
+    """Write a module, or a program of `trace`, as an ONNX model.
+
+    A module whose loops a row program keeps (a rollout, a filter) is written in a second, with ONNX's Loop in
+    the place of each; any other one as `trace` has it. A program of `trace` has its loops unrolled: minutes
+    to write, and quicker to call.
 
     Example:
         >>> plant = systems.TwoState()
         >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
         >>> policy = deploy.policy_of(adp.LQR(plant, cost))
-        >>> program = deploy.trace(policy, torch.zeros(1, 2).double())
-        >>> deploy.export_onnx(program, Path("policy.onnx"), ["state"], ["control"])  # doctest: +SKIP
+        >>> x = torch.zeros(1, 2).double()
+        >>> path = Path("policy.onnx")
+        >>> deploy.export_onnx(policy, path, ["state"], ["control"], example=x)  # doctest: +SKIP
 
         Shown by `staf-export RUN --to onnx`.
 
     Args:
-        program: the program.
+        program: a module, (B, n) -> a tensor or a tuple of them, or a program.
         path: of the file.
         inputs: the name of its input, a list of one.
         outputs: the names of its outputs.
+        example: of a module: an input, (B, n), in its dtype.
+        batch: of a module: rows of every call; any by default.
+        name: of the graph; that of the policy by default.
 
     Raises:
-        ValueError: if the extra ``onnx`` is not installed.
+        ValueError: if the extra ``onnx`` is not installed, a name is there twice, the number of names is
+            wrong, or an argument is missing.
     """
     need_onnx()
+    names = [*_named("inputs", inputs), *_named("outputs", outputs)]
+    twice = [each for each in names if names.count(each) > 1]
+    if twice:
+        rule = "must differ from each other and from the input"
+        raise fail("export_onnx", "outputs", rule, twice[0])
+    if len(inputs) != 1:
+        raise fail("export_onnx", "inputs", "must be one name", list(inputs))
+    module = program if isinstance(program, nn.Module) else None
+    name = function_name("export_onnx", name, module)
+    if module is None:
+        assert not isinstance(program, nn.Module)
+        model = _unrolled(program, names)
+    else:
+        if example is None:
+            raise fail("export_onnx", "example", "must be given with a module: an input (B, n)", example)
+        if trailing("export_onnx", "example", example, dims=2).dim() > 2 or not len(example):
+            raise fail("export_onnx", "example", "must be states (B, n), one at least", tuple(example.shape))
+        if batch is not None:
+            integer("export_onnx", "batch", batch, least=1)
+        check_dtype("export_onnx", module, example)
+        traced = with_loops(module, example)
+        if traced is None:
+            model = _unrolled(trace(module, example, batch=batch), names)
+        else:
+            model = in_loops(traced, names, example.shape[-1], batch, name)
+    model.graph.name = name
+    path.write_bytes(model.SerializeToString())
+
+
+def _named(argument: str, names: Sequence[str]) -> list[str]:
+    """Return names as a list, refused where a file with them could not be loaded."""
+    found = listed_names("export_onnx", names, argument)
+    for each in found:
+        if not each or each.startswith("_"):
+            raise fail("export_onnx", argument, "must not be empty or begin with _", each)
+    return found
+
+
+def _unrolled(program: ExportedProgram, names: Sequence[str]) -> Any:
+    """Return the ONNX model of a program, in which no name within is one of those given."""
+    count = len(program.graph_signature.user_outputs)
+    check_count("export_onnx", names[1:], count)
+    # The exporter warns that torchvision is not there, for operators that nothing here has.
+    logging.getLogger("torch.onnx._internal.exporter._registration").setLevel(logging.ERROR)
+    own = ["_input", *(f"_output_{k}" for k in range(count))]
     with warnings.catch_warnings(action="ignore"):
-        model = torch.onnx.export(
-            program, dynamo=True, input_names=inputs, output_names=outputs, verbose=False, optimize=True
+        made = torch.onnx.export(
+            program, dynamo=True, input_names=own[:1], output_names=own[1:], verbose=False, optimize=True
         )
-        assert model is not None
-        model.save(str(path))
+    assert made is not None
+    return renamed(made.model_proto, dict(zip(own, names, strict=True)))
 
 
 def export_program(program: ExportedProgram, path: Path, note: Mapping[str, object]) -> None:

@@ -12,6 +12,8 @@ from torch import Tensor, nn
 from ..adp import GlobalValue
 from ..adp.planning.global_value import follow_plan
 from ..lanes import Program
+from ..lanes.emit.c import commented
+from ..lanes.emit.identifiers import guarded
 from ..lanes.tree import Tree
 from ..numerics.checks import hold
 
@@ -99,27 +101,32 @@ class RememberedPolicy(nn.Module):
         window = self.plans[self.first[:1].expand(self.lookahead)].unsqueeze(0)
         return {"x": x, "window": window, "end": self.models[:1]}
 
-    def c_text(self, follow: str, outputs: Sequence[str], note: str) -> str:
-        """The header: tables, the text ``follow`` of `program` as ``staf_follow``, and the search."""
+    def c_text(self, name: str, follow: str, outputs: Sequence[str], note: str) -> str:
+        """The header: tables, the text ``follow`` of `program` as ``NAME_follow``, and the search."""
         real = "float" if self.plans.dtype == torch.float32 else "double"
         n, m = self.problem.dim, self.problem.inputs
         floats = ("plans", "models", "searched", "frame")
-        tables = [_table(real, f"staf_{name}", getattr(self, name), real == "float") for name in floats]
+        tables = [_table(real, f"{name}_{each}", getattr(self, each), real == "float") for each in floats]
         whole = ("first", "last", "end")
-        tables += [_table("int", f"staf_{name}", getattr(self, name), False) for name in whole]
+        tables += [_table("int", f"{name}_{each}", getattr(self, each), False) for each in whole]
         sizes = {
-            **{"REAL": real, "N": n, "M": m, "WIDTH": self.plans.shape[1], "MODEL": self.models.shape[1]},
+            **{
+                "NAME": name,
+                "REAL": real,
+                "N": n,
+                "M": m,
+                "WIDTH": self.plans.shape[1],
+                "MODEL": self.models.shape[1],
+            },
             **{"S": len(self.searched), "J": len(self.first) - 1, "K": self.candidates, "H": self.lookahead},
             **{"ROUND": "rintf" if real == "float" else "rint", "CONTROL": outputs[0]},
             "GOAL": ", ".join(repr(float(g)) for g in self.problem.goal),
             "PERIOD": ", ".join(repr(2 * math.pi) if i in self.problem.periodic else "0" for i in range(n)),
         }
         text = _SEARCH
-        for name, value in sizes.items():
-            text = text.replace(f"@{name}@", str(value))
-        lines = ["/*", *(f" * {line}".rstrip() for line in note.replace("*/", "* /").splitlines()), " */"]
-        head = ["#ifndef STAF_H", "#define STAF_H", "", follow.strip(), ""]
-        return "\n".join([*(lines if note else []), *head, *tables, text, "#endif"]) + "\n"
+        for each, value in sizes.items():
+            text = text.replace(f"@{each}@", str(value))
+        return commented(note) + guarded(name, "\n".join([follow.strip(), "", *tables, text]))
 
 
 def _table(kind: str, name: str, table: Tensor, single: bool) -> str:
@@ -128,7 +135,7 @@ def _table(kind: str, name: str, table: Tensor, single: bool) -> str:
     return f"static const {kind} {name}[{table.numel()}] = {{\n{lines}\n}};\n"
 
 
-_SEARCH = """static inline void staf(const @REAL@ state[@N@], @REAL@ @CONTROL@[@M@])
+_SEARCH = """static inline void @NAME@(const @REAL@ state[@N@], @REAL@ @CONTROL@[@M@])
 {
     static const @REAL@ goal[@N@] = { @GOAL@ }, period[@N@] = { @PERIOD@ }; /* 0: no angle */
     @REAL@ at[@N@] = { 0 }, far[@K@], least = (@REAL@)INFINITY;
@@ -136,14 +143,14 @@ _SEARCH = """static inline void staf(const @REAL@ state[@N@], @REAL@ @CONTROL@[@
     for (int i = 0; i < @N@; ++i) {
         @REAL@ away = state[i] - goal[i];
         if (period[i] > 0) away -= @ROUND@(away / period[i]) * period[i];
-        for (int k = 0; k < @N@; ++k) at[k] += away * staf_frame[i * @N@ + k];
+        for (int k = 0; k < @N@; ++k) at[k] += away * @NAME@_frame[i * @N@ + k];
     }
     for (int k = 0; k < @K@; ++k) far[k] = (@REAL@)INFINITY, near[k] = k;
     near[@K@] = @J@; /* the goal's own feedback */
     for (int j = 0; j < @S@; ++j) { /* the @K@ nearest, the nearest first */
         @REAL@ square = 0;
         for (int i = 0; i < @N@; ++i) {
-            const @REAL@ apart = at[i] - staf_searched[j * @N@ + i];
+            const @REAL@ apart = at[i] - @NAME@_searched[j * @N@ + i];
             square += apart * apart;
         }
         if (!(square < far[@K@ - 1])) continue;
@@ -155,10 +162,10 @@ _SEARCH = """static inline void staf(const @REAL@ state[@N@], @REAL@ @CONTROL@[@
         @REAL@ window[@H@ * @WIDTH@], cost[1], control[@M@];
         const int j = near[k];
         for (int t = 0; t < @H@; ++t) {
-            const int row = staf_first[j] + t < staf_last[j] ? staf_first[j] + t : staf_last[j];
-            for (int i = 0; i < @WIDTH@; ++i) window[t * @WIDTH@ + i] = staf_plans[row * @WIDTH@ + i];
+            const int row = @NAME@_first[j] + t < @NAME@_last[j] ? @NAME@_first[j] + t : @NAME@_last[j];
+            for (int i = 0; i < @WIDTH@; ++i) window[t * @WIDTH@ + i] = @NAME@_plans[row * @WIDTH@ + i];
         }
-        staf_follow(state, window, staf_models + staf_end[j] * @MODEL@, cost, control);
+        @NAME@_follow(state, window, @NAME@_models + @NAME@_end[j] * @MODEL@, cost, control);
         if (k > 0 && !(cost[0] < least)) continue;
         least = cost[0];
         for (int i = 0; i < @M@; ++i) @CONTROL@[i] = control[i];

@@ -175,7 +175,7 @@ def markdown(sheet: Mapping[str, Any]) -> str:
         sheet["what"],
         "",
         f"From `{_named(sheet['run'])}`, trajectory {sheet['row']}, by staf_torch {sheet['version']} and "
-        f"torch {sheet['torch']}. Batch B: {sheet['batch']}.",
+        f"torch {sheet['torch']}. Batch B: {sheet['batch']}. Name: `{sheet['name']}`.",
         "",
         "| | name | shape | dtype | unit | region |",
         "|---|---|---|---|---|---|",

@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import bisect
 import math
-import re
 from collections.abc import Sequence
 from typing import ClassVar, NamedTuple
 
 from ..trace.graph import FLAG, NARROW, REAL, ROW, STEP, WHOLE, WIDE, Graph
+from .identifiers import checked_names, guarded
 from .schedule import Schedule, Sizes
 from .statements import StatementWriter
 
 _NAMES = {"abs": "fabs", "round": "rint"}
-
-
-_IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
-_OWN = re.compile(r"([a-z]\d+(_\d+)?)|double|float|int|const|static|inline|void|for|if|else|struct")
 
 
 class Names(NamedTuple):
@@ -156,16 +152,16 @@ def c_text(
     Raises:
         ValueError: if a name is not one of C, or is there twice.
     """
-    given_names = (name, *(each for part in names for each in part))
-    for each in given_names:
-        if not _IDENTIFIER.fullmatch(each) or _OWN.fullmatch(each) or (each == "state" and names.carries):
-            raise ValueError(f"`c_source(name=...)` must be given names of C that are free; got {each!r}.")
-    if len(set(given_names)) < len(given_names):
-        raise ValueError(f"`c_source(...)` must have every name once; got {', '.join(given_names)}.")
+    inputs, stays = [*names.rows, *names.nows], ["state"] if names.carries else []
+    checked_names("c_source", "name", [name], [*inputs, *stays, *names.outputs])
+    checked_names("c_source", "row", inputs, [*stays, "p", "q"])  # indices of loops
+    checked_names("c_source", "carry", list(names.carries), field=True)
+    if len(names.outputs) != len(layout.outputs):
+        rule = f"must be {len(layout.outputs)} names, one an output"
+        raise ValueError(f"`c_source(outputs=...)` {rule}; got {list(names.outputs)}.")
+    checked_names("c_source", "outputs", list(names.outputs), [*inputs, *stays])
     writer = _CWriter(graph, Schedule(graph, following, outputs), layout, names)
-    real, guard = writer.real, f"{name.upper()}_H"
-    lines = ["/*", *(f" * {line}".rstrip() for line in note.replace("*/", "* /").splitlines()), " */"]
-    lines = [*(lines if note else []), f"#ifndef {guard}", f"#define {guard}", "", "#include <math.h>", ""]
+    real, lines = writer.real, ["#include <math.h>", ""]
     arguments = [f"{name}_state *state"] if names.carries else []
     if names.carries:
         fields = zip(names.carries, layout.carries, strict=True)
@@ -186,4 +182,11 @@ def c_text(
     arguments += [f"{real} {n}[{size}]" for n, size in zip(names.outputs, layout.outputs, strict=True)]
     lines += [f"static inline void {name}({', '.join(arguments)})"]
     lines += writer._function(lambda: writer.body(names, following, outputs))
-    return "\n".join([*lines, "", "#endif"]) + "\n"
+    return commented(note) + guarded(name, "\n".join(lines))
+
+
+def commented(note: str) -> str:
+    """Return lines as the comment at the head of a header; nothing of no lines."""
+    inside = note.replace("*/", "* /").replace("/*", "/ *")
+    lines = (f" * {line}".rstrip() for line in inside.splitlines())
+    return "\n".join(["/*", *lines, " */", ""]) if note else ""

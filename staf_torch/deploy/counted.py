@@ -1,0 +1,52 @@
+"""Cost of a call of a row program: what a header, or an ONNX file in loops, computes for one row."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+
+from ..lanes.emit.schedule import Schedule
+from ..lanes.trace.step import Traced
+from .sheet import Work
+
+_CHEAP = set("add sub mul div lt le eq ne and or xor neg abs min max not where sqrt".split())  # noqa: SIM905
+_FREE = set("const elem result collect carry state row now load pack cast loop".split())  # noqa: SIM905
+
+
+class Source(NamedTuple):
+    """Cost of a call of a header."""
+
+    constants: int  # numbers in it
+    flops: int
+    functions: int  # calls of exp and the like
+
+    def work(self, entries: int, dtype: torch.dtype) -> Work:
+        """Return the cost in the words of `staf-export`.
+
+        Args:
+            entries: of all inputs and outputs.
+            dtype: of the arithmetic.
+        """
+        size = dtype.itemsize
+        return Work(self.constants, self.flops, self.functions, self.constants * size, entries * size)
+
+
+def counted(traced: Traced) -> Source:
+    """Return the cost of a call: loops have fixed lengths, and both sides of a choice are computed."""
+    graph, _, following, ends = traced.program
+    schedule = Schedule(graph, following, ends)
+    constants = flops = functions = 0
+    for node in schedule.live:
+        op, count = graph.op[node], schedule.repeats(node)
+        constants += op == "const"
+        if op in ("map", "dot"):
+            aux = graph.aux[node]
+            count *= math.prod(aux[1]) if op == "map" else 2 * aux[0] * aux[1]
+            op = aux[0] if op == "map" else "add"
+        if op in _CHEAP:
+            flops += count
+        elif op not in _FREE:
+            functions += count
+    return Source(constants, flops, functions)

@@ -1,0 +1,413 @@
+"""A row program as an ONNX graph whose loops stay loops: what a policy with rollouts inside becomes.
+
+The scalar program of one row, which `lanes` traces, is written node by node: every number is a column (B, 1),
+an array (B, size), a constant (1, 1); rows are the first dimension, and any batch is the same graph. A loop
+over periods is ONNX's Loop with a body of one period, so that the file does not grow with the horizon.
+Unrolled tensor operations, as `torch.onnx` writes them, take minutes of tracing for a filter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ..lanes.call import Given
+from ..lanes.emit.schedule import Schedule
+from ..lanes.row_independence import doubt
+from ..lanes.trace.graph import FLAG, ROW, STEP, WIDE, Graph
+from ..lanes.trace.step import Traced, trace
+from ..lanes.trace.tracer import NotLoweredError
+from ..lanes.tree import Tree
+from .names import check_count
+from .remembered import RememberedPolicy
+
+_OPSET, _IR = 18, 8
+_BINARY = {"add": "Add", "sub": "Sub", "mul": "Mul", "div": "Div", "pow": "Pow", "lt": "Less", "eq": "Equal"}
+_BINARY |= {"le": "LessOrEqual", "and": "And", "or": "Or", "xor": "Xor"}
+_UNARY = {"neg": "Neg", "abs": "Abs", "sqrt": "Sqrt", "exp": "Exp", "log": "Log", "sin": "Sin", "cos": "Cos"}
+_UNARY |= {"tanh": "Tanh", "floor": "Floor", "ceil": "Ceil", "round": "Round", "not": "Not"}
+_OF_LOOPS = ("loop", "result", "results", "collect", "carry", "carrys")
+
+
+def with_loops(module: nn.Module, example: Tensor) -> Traced | None:
+    """Return the trace of a module that has loops; None where it has none, or rows that are not alone.
+
+    Args:
+        module: (B, n) -> a tensor or a tuple of tensors (B,) and (B, m).
+        example: an input, (B, n).
+    """
+
+    def step(carry: Tree, _: Tree, row: Tree) -> tuple[Tree, Tree]:
+        out = module(row["state"])
+        return carry, (out,) if isinstance(out, Tensor) else tuple(out)
+
+    if isinstance(module, RememberedPolicy):
+        return None
+    given = Given.of((), (), {"state": example[:1].detach().expand(2, -1).contiguous()}, 1)
+    with torch.no_grad():
+        try:
+            traced = trace(step, given, folded=True)
+        except NotLoweredError:
+            return None
+        plain = all(len(shape) < 2 and dtype == example.dtype for shape, dtype in traced.outputs)
+        return traced if plain and traced.program[0].loops and doubt(step, given) is None else None
+
+
+def in_loops(traced: Traced, names: Sequence[str], size: int, batch: int | None, name: str) -> Any:
+    """Return the ONNX model of a trace of `with_loops`.
+
+    Args:
+        traced: of one row.
+        names: of the input and the outputs.
+        size: entries of the input.
+        batch: rows; None for any.
+        name: of the graph.
+    """
+    check_count("export_onnx", names[1:], len(traced.outputs))
+    graph, _, _, ends = traced.program
+    sizes = [shape[0] if shape else None for shape, _ in traced.outputs]
+    return OnnxGraph(graph, ends, sizes, size, names, batch).model(name)
+
+
+def renamed(model: Any, names: Mapping[str, str]) -> Any:
+    """Return a model with other names of values; a value within that has one of them already gets another.
+
+    Args:
+        model: as torch writes it.
+        names: old and new.
+    """
+    table = {new: f"_own_{new}" for new in names.values()} | dict(names)
+
+    def visit(graph: Any) -> None:
+        for value in (*graph.input, *graph.output, *graph.value_info, *graph.initializer):
+            value.name = table.get(value.name, value.name)
+        for node in graph.node:
+            for ends in (node.input, node.output):
+                ends[:] = [table.get(each, each) for each in ends]
+            for attribute in node.attribute:
+                if attribute.HasField("g"):
+                    visit(attribute.g)
+
+    visit(model.graph)
+    return model
+
+
+class OnnxGraph:
+    """An ONNX model of a traced program of one row without a carry and with one input.
+
+    Args:
+        graph: of the trace.
+        outputs: its nodes, of all outputs one after the other.
+        sizes: entries of every output, None for a number.
+        size: entries of the input.
+        names: of the input and the outputs.
+        batch: rows; None for any.
+    """
+
+    def __init__(
+        self,
+        graph: Graph,
+        outputs: Sequence[int],
+        sizes: Sequence[int | None],
+        size: int,
+        names: Sequence[str],
+        batch: int | None,
+    ) -> None:
+        import onnx
+
+        self.onnx, self.graph, self.schedule = onnx, graph, Schedule(graph, [], outputs)
+        self.real = np.dtype(np.float32 if graph.single else np.float64)
+        self.names, self.sizes, self.size, self.batch = names, sizes, size, batch
+        self.roots = list(outputs)
+        self.constants: dict[Any, str] = {}
+        self.initializers: list[Any] = []
+        self.scopes: list[tuple[list[Any], dict[int, str]]] = [([], {})]  # statements, and names of nodes
+        self.single: set[str] = set()  # values of one row, whatever the batch
+        self.count = 0
+        self.results: dict[tuple[str, int, int], str] = {}  # of loops that are written
+
+    def model(self, name: str) -> Any:
+        """Return the model, under a name."""
+        make = self.onnx.helper
+        self._emit("Shape", [self.names[0]], "_rows", end=1)
+        self.rows = self._emit("Concat", ["_rows", self._constant([1], np.int64)], axis=0)
+        for node in (*self.schedule.block(ROW), *self.schedule.block(STEP)):
+            self._statement(node)
+        nodes, ends = iter(self.roots), []
+        kind = make.np_dtype_to_tensor_dtype(self.real)
+        rows = "batch" if self.batch is None else self.batch
+        for output, size in zip(self.names[1:], self.sizes, strict=True):
+            parts = [self._put(next(nodes)) for _ in range(size or 1)]
+            if size is None:
+                self._emit("Squeeze", [parts[0], self._constant([1], np.int64)], output)
+            else:
+                self._emit("Concat", parts, output, axis=1)
+            ends.append(make.make_tensor_value_info(output, kind, [rows] if size is None else [rows, size]))
+        given = make.make_tensor_value_info(self.names[0], kind, [rows, self.size])
+        whole = make.make_graph(self.scopes[0][0], name, [given], ends, initializer=self.initializers)
+        found = make.make_model(
+            whole, opset_imports=[make.make_opsetid("", _OPSET)], producer_name="staf_torch"
+        )
+        found.ir_version = _IR
+        return found
+
+    def _put(self, node: int) -> str:
+        """Return a number of an output, with all rows and in the dtype of the program."""
+        value = self._ref(node)
+        return self._full(value if self._dtype(node) == self.real else self._cast(value, self.real))
+
+    # Values.
+
+    def _new(self, kind: str) -> str:
+        self.count += 1
+        return f"_{kind}_{self.count}"
+
+    def _emit(self, op: str, inputs: Sequence[str], name: str | None = None, **attributes: Any) -> str:
+        """Add an operation; it has one row if all of its inputs have."""
+        name = self._new(op) if name is None else name
+        node = self.onnx.helper.make_node(op, list(inputs), [name], **attributes)
+        self.scopes[-1][0].append(node)
+        if inputs and all(each in self.single for each in inputs) and op != "Shape":
+            self.single.add(name)
+        return name
+
+    def _constant(self, values: Any, dtype: Any) -> str:
+        array = np.asarray(values, dtype=dtype)
+        key = array.dtype.str, array.shape, array.tobytes()
+        if key not in self.constants:
+            name = self.constants[key] = self._new("c")
+            self.initializers.append(self.onnx.numpy_helper.from_array(array, name))
+            self.single.add(name)
+        return self.constants[key]
+
+    def _dtype(self, node: int) -> Any:
+        kind = self.graph.type[node]
+        return np.dtype(bool) if kind == FLAG else np.dtype(np.float64) if kind == WIDE else self.real
+
+    def _cast(self, value: str, dtype: Any) -> str:
+        return self._emit("Cast", [value], to=self.onnx.helper.np_dtype_to_tensor_dtype(np.dtype(dtype)))
+
+    def _full(self, value: str) -> str:
+        """Return a value with all rows."""
+        if value not in self.single:
+            return value
+        full = self._emit("Expand", [value, self.rows])
+        self.single.discard(full)
+        return full
+
+    def _known(self, node: int) -> str | None:
+        return next((names[node] for _, names in reversed(self.scopes) if node in names), None)
+
+    def _ref(self, node: int) -> str:
+        """Return the value of a number or an array, written where nobody has read it before."""
+        known = self._known(node)
+        if known is not None:
+            return known
+        name = self._value(node)
+        self.scopes[-1][1][node] = name
+        return name
+
+    def _value(self, node: int) -> str:
+        graph, op, aux = self.graph, self.graph.op[node], self.graph.aux[node]
+        if op == "const":
+            return self._constant([[graph.value(node)]], self._dtype(node))
+        if op == "row":
+            return self._take(self.names[0], [aux[1]])
+        if op == "elem":
+            return self._take(self._ref(graph.args[node][0]), [aux])
+        if op == "pack":
+            return self._packed(graph.args[node])
+        if op == "load":
+            number, at, stride = aux
+            step = self._constant(stride, np.int64)
+            place = self._emit(
+                "Add", [self._emit("Mul", [f"_i{number}", step]), self._constant(at, np.int64)]
+            )
+            array = self._ref(graph.args[node][0])
+            found = self._emit(
+                "Gather", [array, self._emit("Unsqueeze", [place, self._constant([0], np.int64)])], axis=1
+            )
+            return self._marked(found, array in self.single)
+        if op in ("map", "dot"):
+            return self._map(node) if op == "map" else self._dot(node)
+        if op in ("result", "results", "collect"):
+            return self.results[op.removesuffix("s"), aux[0], aux[1]]
+        return self._operation(op, [self._ref(a) for a in graph.args[node]], node)
+
+    def _marked(self, name: str, single: bool) -> str:
+        (self.single.add if single else self.single.discard)(name)
+        return name
+
+    def _take(self, array: str, places: Sequence[int]) -> str:
+        return self._emit("Gather", [array, self._constant(list(places), np.int64)], axis=1)
+
+    def _packed(self, nodes: Sequence[int]) -> str:
+        graph = self.graph
+        if all(graph.op[node] == "const" for node in nodes):
+            return self._constant([[graph.value(node) for node in nodes]], self._dtype(nodes[0]))
+        values = [self._ref(node) for node in nodes]
+        if not all(value in self.single for value in values):
+            values = [self._full(value) for value in values]
+        return self._emit("Concat", values, axis=1)
+
+    def _map(self, node: int) -> str:
+        op, shape, *places = self.graph.aux[node]
+        values = []
+        for operand, place in zip(self.graph.args[node], places, strict=True):
+            value = self._ref(operand)
+            values.append(value if place is None else self._take(value, place))
+        if op == "copy":
+            return self._emit("Identity", values)
+        found = self._operation(op, values, node)
+        if all(place is None for place in places):
+            size = self._constant([1, int(np.prod(shape))], np.int64)
+            return self._marked(self._emit("Expand", [found, size]), found in self.single)
+        return found
+
+    def _dot(self, node: int) -> str:
+        outs, count, *places = self.graph.aux[node]
+        values = []
+        for operand, place in zip(self.graph.args[node], places, strict=True):
+            value = self._ref(operand)
+            if place is not None:
+                shape = self._constant([-1, outs, count], np.int64)
+                value = self._emit("Reshape", [self._take(value, place), shape])
+            else:
+                value = self._emit("Unsqueeze", [value, self._constant([2], np.int64)])
+            values.append(value)
+        product = self._emit("Mul", values)
+        return self._emit("ReduceSum", [product, self._constant([2], np.int64)], keepdims=0)
+
+    # Operations.
+
+    def _operation(self, op: str, values: Sequence[str], node: int) -> str:
+        if op in _BINARY or op in _UNARY:
+            return self._emit(_BINARY.get(op) or _UNARY[op], values)
+        if op == "where" and self.graph.type[node] == FLAG:  # of flags onnxruntime has no choice
+            chosen, a, b = values
+            other = self._emit("And", [self._emit("Not", [chosen]), b])
+            return self._emit("Or", [self._emit("And", [chosen, a]), other])
+        if op == "where":
+            return self._where(*values)
+        if op == "ne":
+            return self._emit("Not", [self._emit("Equal", values)])
+        if op == "cast":
+            return self._cast(values[0], self._dtype(node))
+        if op in ("min", "max"):  # NaN wins
+            a, b = values
+            first = self._emit("Less", [a, b] if op == "min" else [b, a])
+            return self._where(self._emit("Or", [first, self._emit("IsNaN", [a])]), a, b)
+        written: Callable[..., str] = getattr(self, f"_{op}")
+        return written(*values, self._dtype(node))
+
+    def _where(self, chosen: str, a: str, b: str) -> str:
+        return self._emit("Where", [chosen, a, b])
+
+    def _tan(self, x: str, dtype: Any) -> str:
+        return self._emit("Div", [self._emit("Sin", [x]), self._emit("Cos", [x])])
+
+    def _trunc(self, x: str, dtype: Any) -> str:
+        below = self._emit("Less", [x, self._constant([[0]], dtype)])
+        return self._where(below, self._emit("Ceil", [x]), self._emit("Floor", [x]))
+
+    def _expm1(self, x: str, dtype: Any) -> str:
+        """Kahan's (e^x - 1) x / log(e^x), which keeps the digits of a small x."""
+        one, power = self._constant([[1]], dtype), self._emit("Exp", [x])
+        less = self._emit("Sub", [power, one])
+        exact = self._emit("Div", [self._emit("Mul", [less, x]), self._emit("Log", [power])])
+        ends = self._emit(
+            "Or", [self._emit("IsInf", [self._emit("Log", [power])]), self._emit("IsInf", [power])]
+        )
+        return self._where(self._emit("Equal", [power, one]), x, self._where(ends, less, exact))
+
+    def _log1p(self, x: str, dtype: Any) -> str:
+        """Kahan's log(1 + x) x / ((1 + x) - 1)."""
+        one = self._constant([[1]], dtype)
+        more = self._emit("Add", [x, one])
+        log = self._emit("Log", [more])
+        exact = self._emit("Div", [self._emit("Mul", [log, x]), self._emit("Sub", [more, one])])
+        ends = self._emit("IsInf", [log])
+        return self._where(self._emit("Equal", [more, one]), x, self._where(ends, log, exact))
+
+    def _atan2(self, y: str, x: str, dtype: Any) -> str:
+        """The angle by Atan in float32, all that onnxruntime has, and what a rotation by it leaves."""
+        single = np.float32
+        zero = self._constant([[0]], dtype)
+        steep = self._emit("Less", [self._emit("Abs", [x]), self._emit("Abs", [y])])
+        none = self._emit("And", [self._emit("Equal", [x, zero]), self._emit("Equal", [y, zero])])
+        low = self._where(none, self._constant([[1]], dtype), self._where(steep, y, x))
+        ratio = self._emit("Div", [self._where(steep, x, y), low])
+        rough = self._cast(self._emit("Atan", [self._cast(ratio, single)]), dtype)
+        half = self._constant([[np.pi / 2]], dtype)
+        turned = self._where(self._negative(y, dtype), self._emit("Neg", [half]), half)
+        flat = self._where(self._negative(x, dtype), self._emit("Add", [turned, turned]), zero)
+        angle = self._where(steep, self._emit("Sub", [turned, rough]), self._emit("Add", [flat, rough]))
+        sin, cos = self._emit("Sin", [angle]), self._emit("Cos", [angle])
+        across = self._emit("Sub", [self._emit("Mul", [y, cos]), self._emit("Mul", [x, sin])])
+        along = self._emit("Add", [self._emit("Mul", [x, cos]), self._emit("Mul", [y, sin])])
+        left = self._emit("Div", [across, self._where(none, self._constant([[1]], dtype), along)])
+        far = self._emit("IsInf", [self._emit("Add", [self._emit("Abs", [x]), self._emit("Abs", [y])])])
+        return self._where(far, angle, self._emit("Add", [angle, left]))
+
+    def _negative(self, x: str, dtype: Any) -> str:
+        """Return whether a number is below 0, or -0."""
+        zero = self._constant([[0]], dtype)
+        inverse = self._emit("Div", [self._constant([[1]], dtype), x])
+        return self._emit("Or", [self._emit("Less", [x, zero]), self._emit("Less", [inverse, zero])])
+
+    # Loops.
+
+    def _statement(self, node: int) -> None:
+        if self.graph.op[node] == "loop":
+            self._loop(self.graph.aux[node])
+        elif self.graph.op[node] not in _OF_LOOPS:
+            self._ref(node)
+
+    def _loop(self, number: int) -> None:
+        """Write the Loop: carried values have all rows, and what a pass leaves behind is stacked."""
+        make, loop = self.onnx.helper, self.graph.loops[number]
+        live, kept = sorted(self.schedule.carries.get(number, ())), sorted(self.schedule.collected(number))
+        initial = [self._full(self._ref(loop.initial[k])) for k in live]
+        names = [f"_l{number}_{k}" for k in live]
+        self.scopes.append(([], {loop.carry[k]: name for k, name in zip(live, names, strict=True)}))
+        for node in self.schedule.body(number):
+            self._statement(node)
+        going = self._going(loop.going)
+        after = [self._emit("Identity", [self._full(self._ref(loop.following[k]))]) for k in live]
+        put = [self._emit("Identity", [self._full(self._packed(loop.collected[k]))]) for k in kept]
+        statements, _ = self.scopes.pop()
+        flag, index = self.onnx.TensorProto.BOOL, self.onnx.TensorProto.INT64
+        begins = [make.make_tensor_value_info(f"_i{number}", index, [])]
+        begins.append(make.make_tensor_value_info(f"_g{number}", flag, []))
+        begins += [self._info(name, loop.carry[k]) for name, k in zip(names, live, strict=True)]
+        ends = [make.make_tensor_value_info(going, flag, [])]
+        ends += [self._info(name, loop.carry[k]) for name, k in zip(after, live, strict=True)]
+        ends += [
+            self._info(name, loop.collected[k][0], len(loop.collected[k]))
+            for name, k in zip(put, kept, strict=True)
+        ]
+        body = make.make_graph(statements, f"loop_{number}", begins, ends)
+        results, stacked = [f"_r{number}_{k}" for k in live], [f"_y{number}_{k}" for k in kept]
+        given = [self._constant(loop.count, np.int64), self._constant(True, bool), *initial]
+        self.scopes[-1][0].append(make.make_node("Loop", given, [*results, *stacked], body=body))
+        self.results |= {("result", number, k): name for k, name in zip(live, results, strict=True)}
+        for k, name in zip(kept, stacked, strict=True):
+            flat = self._emit("Transpose", [name], perm=[1, 0, 2])
+            shape = self._constant([-1, loop.count * len(loop.collected[k])], np.int64)
+            self.results["collect", number, k] = self._emit("Reshape", [flat, shape])
+
+    def _going(self, node: int) -> str:
+        """Return whether any row took this pass: none takes another one then."""
+        if node < 0:
+            return self._emit("Identity", [self._constant(True, bool)])
+        taken = self._cast(self._ref(node), np.int32)
+        return self._cast(self._emit("ReduceMax", [taken], keepdims=0), bool)
+
+    def _info(self, name: str, node: int, size: int | None = None) -> Any:
+        make, kind = self.onnx.helper, self._dtype(node)
+        shape = [None, self.graph.size(node) if size is None else size]
+        return make.make_tensor_value_info(name, make.np_dtype_to_tensor_dtype(kind), shape)
