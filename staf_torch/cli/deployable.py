@@ -15,12 +15,15 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor, nn
 
 from .. import __version__
-from ..adp import Controller, simulate
+from ..adp import Controller, Feedback, LoopResult, SafetyFilter, Supervised, simulate
+from ..adp.loop.setup import AdpProblem
 from ..adp.loop.simulation import uniform_numbers
+from ..adp.planning.receding_horizon import StrainedPlans
 from ..approximation.staf import StaF
 from ..deploy import approximator, policy_of
+from ..deploy.controllers import in_dtype
 from ..deploy.sheet import Port
-from ..experiments.adp import learner
+from ..experiments.adp import innermost, learner
 from ..numerics.checks import fail, integer
 from ..results import run_record as records
 from ..results.files import HISTORY, HYDRA
@@ -29,7 +32,7 @@ from ..results.untrusted import UnreadableError, read_bytes
 from ..settings.adp import adp_problem
 from ..settings.chase import chase_problem
 from ..settings.trust import foreign_settings, refusal
-from ..sweeps.hydra_compat import everything_trusted
+from ..sweeps.hydra_compat import everything_trusted, working_directory_imports
 from ..systems import Units
 
 _POINTS = 1000
@@ -50,7 +53,11 @@ class Deployable:
     written_by: str | None = None  # the version that made the run, where it says
 
 
-def deployable(run: Path, row: int = 0, *, trust: bool = False) -> Deployable:
+class CarriesPlanError(ValueError):
+    """The run's controller carries a plan, and is no function of x."""
+
+
+def deployable(run: Path, row: int = 0, *, trust: bool = False, function: bool = False) -> Deployable:
     """Return the deployable part of one trajectory: its controller, or its approximation at the last time.
 
     The objects are built anew from the run's settings, and must reproduce what the run recorded.
@@ -59,14 +66,22 @@ def deployable(run: Path, row: int = 0, *, trust: bool = False) -> Deployable:
         run: the directory.
         row: the trajectory.
         trust: whether code of your own that the settings name may be imported.
+        function: of a controller that carries a plan where a bound is met: take its policy, which does not.
 
     Raises:
+        CarriesPlanError: if the controller carries a plan, and ``function`` is not set.
         ValueError: if the directory is no run, lacks its history, holds another experiment, names foreign
             code, or was written by a version whose numbers this one does not reproduce.
     """
     tasks = {"gradient_chase": _approximation, "adp": _controller}
     with _opened(run, row, tasks, trust) as (cfg, history, precise, written_by):
-        return dataclasses.replace(tasks[cfg.task](cfg, history, precise), written_by=written_by)
+        if cfg.task == "adp":
+            found = _controller(cfg, history, precise, row, function)
+        elif function:
+            raise fail("staf-export", "function", "must go with a run of adp", cfg.task)
+        else:
+            found = _approximation(cfg, history, precise)
+        return dataclasses.replace(found, written_by=written_by)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,6 +90,7 @@ class Learner:
 
     what: str  # one sentence
     controller: Controller
+    learns: bool  # False: it carries a plan
     dt: float  # s
     states: Tensor  # (K, n), float64
     uniform: Tensor  # (K, draws, n) random numbers of [-1, 1]
@@ -84,17 +100,17 @@ class Learner:
 
     def copied(self, dtype: torch.dtype) -> Controller:
         """Return the controller in a dtype."""
-        return copy.deepcopy(self.controller).to(dtype)
+        return in_dtype(self.controller, dtype)
 
 
 def learning(run: Path, row: int = 0, *, trust: bool = False) -> Learner:
-    """The controller of one trajectory as it was at time 0, that learns as it did in the run.
+    """The controller of one trajectory as it was at time 0, that learns or plans as it did in the run.
 
     Args:
         run, row, trust: as in `deployable`.
 
     Raises:
-        ValueError: as `deployable`, or if nothing in the run's controller learns.
+        ValueError: as `deployable`, or if the run's controller is a function of x.
     """
     with _opened(run, row, {"adp": _learner}, trust) as (cfg, history, precise, written_by):
         return dataclasses.replace(_learner(cfg, history, precise, row), written_by=written_by)
@@ -115,16 +131,34 @@ def _opened(
         history = _history(run, row)
         precise = cfg.dtype == "float64"
         cfg.dtype, cfg.device = "float64", "cpu"
-        with everything_trusted() if trust else contextlib.nullcontext():
+        with contextlib.ExitStack() as stack:
+            for each in (everything_trusted, working_directory_imports) if trust else ():
+                stack.enter_context(each())
             yield cfg, history, precise, written_by
-    except (ValueError, OSError):
-        raise
-    except Exception as error:  # settings of another version, or of nobody's
+    except Exception as error:
+        absent = _absent(error)
+        if absent is not None:
+            raise ValueError(
+                f"{run} needs the module {absent}, which is neither in {Path.cwd()} nor on Python's path: "
+                f"run staf-export where `staf` was run, in the folder with {absent.replace('.', '/')}.py."
+            ) from error
+        if isinstance(error, ValueError | OSError):
+            raise
+        # settings of another version, or of nobody's
         raise ValueError(
             f"{run} was written by staf_torch {written_by or '(another version)'}, whose settings "
             f"staf_torch {__version__} does not understand ({_first_line(error)}): run it anew, "
             "or export it with that version."
         ) from error
+
+
+def _absent(error: BaseException | None) -> str | None:
+    """Return the module of the user's own that was not found, None where the error is another one."""
+    while error is not None:
+        if isinstance(error, ModuleNotFoundError):
+            return error.name
+        error = error.__cause__ or error.__context__
+    return None
 
 
 def _first_line(error: Exception) -> str:
@@ -218,12 +252,27 @@ def _approximation(cfg: DictConfig, history: dict[str, Tensor], precise: bool) -
     )
 
 
-def _controller(cfg: DictConfig, history: dict[str, Tensor], precise: bool) -> Deployable:
+def _controller(
+    cfg: DictConfig, history: dict[str, Tensor], precise: bool, row: int, function: bool
+) -> Deployable:
     problem = adp_problem(cfg)
     states, weights = history["state"], history["actor_weights"]
-    learns = learner(problem.controller) is not None
-    last = policy_of(problem.controller, weights[-2] if learns else None)
-    _reproduced("control", last(states[-2:-1])[0], history["control"][-2], precise)
+    learns, controller = learner(problem.controller) is not None, problem.controller
+    if not learns and not isinstance(innermost(controller), Feedback):
+        if not function:
+            raise CarriesPlanError(
+                f"The controller of this run, {controller.label}, carries a plan from control to control "
+                "where a bound is met: `--to c` writes it with its plan in a structure, `--function` in any "
+                "format its policy as a function of x, which does not plan."
+            )
+        _replayed(problem, history, precise, row)
+        controller = without_plans(controller)
+    elif function:
+        rule = "must be left away: what this run's controller does is a function of x, or it learns"
+        raise fail("staf-export", "function", rule, controller.label)
+    else:
+        last = policy_of(controller, weights[-2] if learns else None)
+        _reproduced("control", last(states[-2:-1])[0], history["control"][-2], precise)
     low, high = states.amin(0), states.amax(0)
     generator = torch.Generator().manual_seed(0)
     points = low + (high - low) * torch.rand(_POINTS, len(low), dtype=torch.float64, generator=generator)
@@ -232,19 +281,38 @@ def _controller(cfg: DictConfig, history: dict[str, Tensor], precise: bool) -> D
     learned = f", {weights.shape[-1]} actor weights as they were at the end" if learns else ""
     return Deployable(
         "controller",
-        f"The control u(x) of {type(problem.system).__name__} by {problem.controller.label}{learned}.",
-        lambda dtype: policy_of(problem.controller, weights[-1] if learns else None, dtype),
+        f"The control u(x) of {type(problem.system).__name__} by {controller.label}{learned}"
+        f"{', without the plans that the run made where a bound is met' if function else ''}.",
+        lambda dtype: policy_of(controller, weights[-1] if learns else None, dtype),
         points,
         Port("state", len(low), unit.state, f"visited: {box}"),
         (Port("control", history["control"].shape[-1], unit.input, f"to be held for {problem.dt:g} s"),),
     )
 
 
-def _learner(cfg: DictConfig, history: dict[str, Tensor], precise: bool, row: int) -> Learner:
-    problem = adp_problem(cfg)
-    if learner(problem.controller) is None:
-        what = type(problem.controller).__name__
-        raise fail("staf-export", "learning", "must be left away where nothing learns", what)
+def without_plans(controller: Controller) -> Controller:
+    """Return a controller with the policy of the one that plans in its place.
+
+    Raises:
+        ValueError: if that is no policy with plans where a bound is met.
+    """
+    if isinstance(controller, SafetyFilter | Supervised):
+        other = copy.copy(controller)
+        other.__dict__ = {**vars(controller), "_modules": dict(controller._modules)}
+        other.controller = without_plans(controller.controller)
+        return other
+    if not isinstance(controller, StrainedPlans):
+        rule = (
+            "must go with `near_optimal`: what this run's controller does is no function of x without plans"
+        )
+        raise fail("staf-export", "function", rule, controller.label)
+    return Feedback(controller.policy)
+
+
+def _replayed(
+    problem: AdpProblem, history: dict[str, Tensor], precise: bool, row: int
+) -> tuple[LoopResult, int]:
+    """Return the first steps of a run again, compared with what it recorded, and their number."""
     x0, seed = problem.initial_states[row : row + 1], problem.seed + row
     steps = max(problem.every, min(problem.steps, _FOLLOWED) // problem.every * problem.every)
     found = simulate(
@@ -256,22 +324,36 @@ def _learner(cfg: DictConfig, history: dict[str, Tensor], precise: bool, row: in
         steps=steps,
         seed=seed,
         integrator=problem.integrator,
-        compile=False,
+        compile=problem.compile if learner(problem.controller) is None else False,
     )
     recorded = history["control"][: steps // problem.every]
     _reproduced("control", found.control[0, 0 : steps : problem.every], recorded, precise)
+    return found, steps
+
+
+def _learner(cfg: DictConfig, history: dict[str, Tensor], precise: bool, row: int) -> Learner:
+    problem = adp_problem(cfg)
+    learns = learner(problem.controller) is not None
+    if not learns and isinstance(innermost(problem.controller), Feedback):
+        what = type(problem.controller).__name__
+        raise fail("staf-export", "learning", "must be left away where nothing learns", what)
+    found, steps = _replayed(problem, history, precise, row)
+    x0, seed = problem.initial_states[row : row + 1], problem.seed + row
     generators = [torch.Generator().manual_seed(seed)] if problem.controller.draws else []
     uniform = uniform_numbers(x0, steps, problem.controller.draws, generators)[0]
     unit, size = problem.system.units, x0.shape[-1]
-    inputs = [Port("x", size, unit.state, "as the weights have learned it")]
+    inputs = [Port("x", size, unit.state, "as the weights have learned it" if learns else "of the plant")]
     if problem.controller.draws:
         numbers = problem.controller.draws * size
         inputs.append(Port("uniform", numbers, "1", "random numbers of [-1, 1], new in every step"))
     return Learner(
-        f"One step of {problem.controller.label} on {type(problem.system).__name__}, from the weights of "
-        f"time 0: the control to hold for {problem.dt:g} s, before any bounds of the actuator, and new "
-        "weights.",
+        f"One step of {problem.controller.label} on {type(problem.system).__name__}, from the "
+        f"{'weights' if learns else 'plan'} of time 0: the control to hold for {problem.dt:g} s, "
+        + (
+            "before any bounds of the actuator, and new weights." if learns else "and the plan from there on."
+        ),
         problem.controller,
+        learns,
         problem.dt,
         found.state[0, :steps],
         uniform,

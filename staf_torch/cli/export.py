@@ -24,7 +24,7 @@ from ..numerics.checks import choice, fail
 from ..results.files import write_text
 from ..results.untrusted import visible
 from ..settings.chase import DTYPES
-from .deployable import Deployable, Learner, deployable, learning
+from .deployable import CarriesPlanError, Deployable, Learner, deployable, learning
 
 _PORTS = ("state", "control", "value", "gradient", "x", "u", "uniform")  # names of inputs and outputs
 ENDINGS = {"onnx": ".onnx", "pt2": ".pt2", "aoti": ".aoti.pt2", "c": ".h"}
@@ -34,6 +34,7 @@ _NEEDS: dict[str, Callable[[], object]] = {
     "aoti": formats.need_compiler,
     "c": c_header.need_c_compiler,
 }
+_ROUNDED = 0.05  # what float32 may lose, by its error against float64, in a file that is kept
 _SAME = {"float64": 1e-9, "float32": 1e-3}  # farther from the library a file is broken, and not left behind
 
 
@@ -48,6 +49,7 @@ def export(
     calls: int = sheet.CALLS,
     trust: bool = False,
     name: str | None = None,
+    function: bool = False,
 ) -> dict[str, Any]:
     """Write the file and its sheet (the same name with .json and .md), and return the sheet.
 
@@ -61,6 +63,7 @@ def export(
         calls: that the latency is the worst of.
         trust: as in `deployable`.
         name: of the C function or the graph; that of the run's folder by default.
+        function: as in `deployable`.
 
     Raises:
         ValueError: if an argument breaks its rule, an extra or a compiler is missing, the run cannot be
@@ -69,10 +72,15 @@ def export(
     choice("staf-export", "to", to, tuple(ENDINGS))
     choice("staf-export", "dtype", dtype, tuple(DTYPES))
     _NEEDS.get(to, lambda: None)()
-    name = _called(name, run, row)
+    given, name = name, _called(name, run, row)
     if to == "c":
         batch = 1
-    found = deployable(run, row, trust=trust)
+    try:
+        found = deployable(run, row, trust=trust, function=function)
+    except CarriesPlanError:
+        if to != "c":
+            raise
+        return export_learning(run, dtype=dtype, output=output, row=row, calls=calls, trust=trust, name=given)
     path = _file(run, output, f"{found.kind}{ENDINGS[to]}")
     module = found.module(DTYPES[dtype])
     origin: dict[str, object] = {"run": str(run), "row": row, "name": name}
@@ -96,10 +104,10 @@ def export_learning(
     trust: bool = False,
     name: str | None = None,
 ) -> dict[str, Any]:
-    """Write a C header of a controller that goes on learning and its sheet, and return the sheet.
+    """Write a C header of a controller that goes on learning, or carries a plan, and its sheet.
 
-    The header has the weights of time 0 and must follow the first steps of the run: the same states and
-    random numbers give the same controls.
+    The header has the weights, or the plan, of time 0 and must follow the first steps of the run: the same
+    states and random numbers give the same controls.
 
     Args:
         run, dtype, output, row, calls, trust, name: as in `export`; the default name ends with ``_learner``.
@@ -109,9 +117,10 @@ def export_learning(
     """
     choice("staf-export", "dtype", dtype, tuple(DTYPES))
     c_header.need_c_compiler()
-    name = _called(name, run, row, "_learner")
+    _called(name, run, row)
     found, real = learning(run, row, trust=trust), DTYPES[dtype]
-    path = _file(run, output, "learner.h")
+    name = _called(name, run, row, "_learner" if found.learns else "")
+    path = _file(run, output, "learner.h" if found.learns else "controller.h")
     origin: dict[str, object] = {"run": str(run), "row": row, "name": name}
     note = f"{found.what}\nFrom {run}, trajectory {row}, staf_torch {__version__}."
     states, uniform = found.states.to(real), found.uniform.to(real)
@@ -168,8 +177,10 @@ def _page(
     facts: dict[str, Any],
 ) -> dict[str, Any]:
     """Write the sheet beside a file that computes what the library does, and return it."""
-    worst = max(facts["equality"].values())
-    if not worst <= _SAME[ends["dtype"]]:
+    worst, same = max(facts["equality"].values()), _SAME[ends["dtype"]]
+    if ends["dtype"] == "float32":  # a plan ends where its next step is small: nobody has more digits than it
+        same = max(same, min(_ROUNDED, 3 * max(facts["float32_error"].values())))
+    if not worst <= same:
         path.unlink()
         raise ValueError(f"{path} differs from the library by {worst:.3g} and was removed.")
     page = {
@@ -203,16 +214,18 @@ def _write(
     names, name, example = [port.name for port in found.outputs], str(origin["name"]), found.points.to(dtype)
     if to == "onnx":
         loops = with_loops(module, example)
-        program = module if loops is not None else trace(module, example, batch=batch)
-        given = {"example": example, "batch": batch} if loops is not None else {}
-        formats.export_onnx(program, path, [found.input.name], names, name=name, **given)
-        entries = example.shape[1] + sum(port.size or 1 for port in found.outputs)
-        work = sheet.work(program) if loops is None else counted(loops).work(entries, dtype)
-        return formats.runner_onnx(path), work
+        if loops is not None:
+            entries = example.shape[1] + sum(port.size or 1 for port in found.outputs)
+            ports = [found.input.name], names
+            formats.export_onnx(module, path, *ports, example=example, batch=batch, name=name)
+            return formats.runner_onnx(path), counted(loops).work(entries, dtype)
     program = trace(module, example, batch=batch)
+    if to == "onnx":
+        formats.export_onnx(program, path, [found.input.name], names, name=name)
+        return formats.runner_onnx(path), sheet.work(program)
     if to == "pt2":
-        ports = {"input": dataclasses.asdict(found.input), "outputs": names, "what": found.what}
-        formats.export_program(program, path, {"version": __version__, **origin, **ports})
+        said = {"input": dataclasses.asdict(found.input), "outputs": names, "what": found.what}
+        formats.export_program(program, path, {"version": __version__, **origin, **said})
         return formats.runner_program(path), sheet.work(program)
     formats.export_package(program, path)
     return formats.runner_package(path), sheet.work(program)
@@ -269,6 +282,11 @@ def parser() -> argparse.ArgumentParser:
         "--learning", action="store_true", help="with --to c: the controller goes on learning, from time 0"
     )
     found.add_argument("--name", help="of the C function or the graph; the run's folder by default")
+    found.add_argument(
+        "--function",
+        action="store_true",
+        help="of near_optimal with bounds: its function of x, without plans",
+    )
     found.add_argument("--trust", action="store_true", help="import code of your own that the settings name")
     return found
 
@@ -279,6 +297,8 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         if not given.pop("learning"):
             page = export(**given)
+        elif given.pop("function"):
+            raise fail("staf-export", "function", "must not go with --learning", True)
         elif (to := given.pop("to")) != "c":
             raise fail("staf-export", "learning", "must go with --to c: the other formats have no state", to)
         elif (batch := given.pop("batch")) not in (None, 1):

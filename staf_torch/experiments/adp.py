@@ -223,11 +223,17 @@ def _gains(gains: Sequence[Gains], counts: Tensor, like: Tensor) -> Gains:
     return Gains(**{name: joined([getattr(each, name) for each in gains]) for name in names})
 
 
-def learner(controller: Controller) -> ActorCritic | None:
-    """Return what learns in a controller, behind a supervisor or a filter; None where nothing does."""
+def innermost(controller: Controller) -> Controller:
+    """Return the controller behind supervisors and filters."""
     while isinstance(controller, Supervised | SafetyFilter):
         controller = controller.controller
-    return controller if isinstance(controller, ActorCritic) else None
+    return controller
+
+
+def learner(controller: Controller) -> ActorCritic | None:
+    """Return what learns in a controller, behind a supervisor or a filter; None where nothing does."""
+    inner = innermost(controller)
+    return inner if isinstance(inner, ActorCritic) else None
 
 
 def recorded(result: LoopResult) -> dict[str, Tensor]:

@@ -189,9 +189,9 @@ def test_c_header_of_a_controller_that_learns_moves_the_same_weights(tmp_path: P
     plant, cost, law = systems.TwoState(), adp.QuadraticCost(1.0, 1.0, 2, 1), adp.Information()
     controller = adp.ActorCritic(adp.QuadraticBasis(2), plant, cost, adp.RandomPoints(1, 1.0), law, gain=1.0)
     x = torch.tensor([[-1.0, 1.0]], dtype=torch.float64)
-    deploy.export_learning_c(controller, x, tmp_path / "a.h", dt=1e-3)
-    source = '#include "a.h"\nstatic staf_state s;\nvoid begin(void) { staf_start(&s); }\n'
-    source += "void call(const double *x, const double *z, double *u) { staf(&s, x, z, u); }\n"
+    deploy.export_learning_c(controller, x, tmp_path / "a.h", dt=1e-3, name="go")
+    source = '#include "a.h"\nstatic go_state s;\nvoid begin(void) { go_start(&s); }\n'
+    source += "void call(const double *x, const double *z, double *u) { go(&s, x, z, u); }\n"
     source += "void learned(double *w) { for (int i = 0; i < 3; ++i) w[i] = s.critic[i]; }\n"
     (tmp_path / "a.c").write_text(source)
     line = [need_c_compiler(), "-O2", "-Wall", "-Werror", "-shared", "-fPIC", "a.c", "-o", "a.so", "-lm"]
@@ -387,13 +387,14 @@ def test_a_sheet_is_one_page_and_names_nothing_that_a_terminal_obeys() -> None:
         **{"torch": "2.9", "batch": "any", "dtype": "float32", "inputs": [port], "outputs": [port]},
         "work": {"parameters": 7, "bytes_constants": 28, "bytes_in_out": 12, "flops": 40, "functions": 2},
         "latency": {"calls": 100, "median_us": 1.26, "p99_us": 2.04, "worst_us": 30.0},
+        "name": "policy",
         **{"runtime": "C", "machine": "a processor"},
         **{"equality": {"u": 1.234e-7}, "float32_error": {"u": 0.5}},
     }
     lines = sheet.markdown(page).splitlines()
     assert (
-        "From `/runs/a'b\\nc\\u001b[2J`, trajectory 3, by staf_torch 1.2 and torch 2.9. Batch B: any."
-        in lines
+        "From `/runs/a'b\\nc\\u001b[2J`, trajectory 3, by staf_torch 1.2 and torch 2.9. Batch B: any. "
+        "Name: `policy`." in lines
     )
     assert "| output | `u` | (B,) | float32 | N | any |" in lines
     assert "| constants | 7 (28 bytes) |" in lines

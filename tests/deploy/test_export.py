@@ -107,7 +107,7 @@ def test_a_controller_that_learns_follows_its_run_in_c(dtype: str, runs: Path, t
     assert [port["name"] for port in page["inputs"]] == ["x", "uniform"]
     assert (page["to"], page["dtype"], page["batch"]) == ("c", dtype, 1)
     assert (tmp_path / "learner.h.md").exists()
-    assert "staf_start(staf_state *" in (tmp_path / "learner.h").read_text()
+    assert "actor_1_learner_start(actor_1_learner_state *" in (tmp_path / "learner.h").read_text()
 
 
 @needs_cc

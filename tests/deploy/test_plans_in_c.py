@@ -69,7 +69,7 @@ def test_memory_in_c_has_the_control_of_the_library_and_says_what_a_call_takes(
     said = f"compares {2 * len(memory.entries)} states and takes at most {source.flops} additions"
     assert said in path.read_text()
     assert "rint(" in path.read_text()
-    (follows,) = re.findall(r"void staf_follow\(([^)]*)\)", path.read_text())
+    (follows,) = re.findall(r"void remembered_follow\(([^)]*)\)", path.read_text())
     assert re.findall(r"\w+(?=\[|,|$)", follows)[-2:] == ["cost", "control"], follows
     timed = deploy.time_c(path, x, [1])
     assert timed.calls == 200

@@ -128,7 +128,7 @@ def test_a_header_starts_with_the_first_row_and_has_the_names_of_its_trees() -> 
 @pytest.mark.parametrize("name", ["9x", "state", "t3", "a-b", "double"])
 def test_a_name_that_c_does_not_take_is_refused(name: str) -> None:
     program = lanes.Program(lambda x, _, __: (x, x))
-    with pytest.raises(ValueError, match="names of C"):
+    with pytest.raises(ValueError, match=rf"`c_source\(outputs=...\)` must .*; got '{name}'"):
         program.c_source("f", torch.ones(1), outputs=[name])
 
 

@@ -44,11 +44,15 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def ran(folder: Path) -> list[tuple[int, str]]:
-    """Run the command lines of the three programs in a folder: exit code, and output and errors together."""
-    sys.path.insert(0, str(folder))
+    """Run the command lines of the three programs in a folder: exit code, and output and errors together.
+
+    As from a shell: nothing leads to the folder, and no command has imported anything for the next one.
+    """
     found = []
     for line in COMMANDS:
         program, *arguments = shlex.split(line)
+        for name in [n for n, m in sys.modules.items() if str(folder) in str(getattr(m, "__file__", ""))]:
+            del sys.modules[name]
         if program == "staf":
             code, out, err = one(str(folder), arguments)
             found.append((code, out + err))

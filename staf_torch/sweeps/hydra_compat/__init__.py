@@ -25,3 +25,4 @@ from .program import is_about_settings as is_about_settings
 from .program import named_packages as named_packages
 from .program import overrides_in as overrides_in
 from .program import program as program
+from .program import working_directory_imports as working_directory_imports

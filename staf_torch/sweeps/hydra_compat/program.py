@@ -103,7 +103,7 @@ def application(argv: Sequence[str]) -> Iterator[Application]:
     words = arguments(argv)
     name = words.config_name or "config"
     with contextlib.ExitStack() as stack:
-        for guard in (_import_path, _environment, _other_application, handlers_aside):
+        for guard in (working_directory_imports, _environment, _other_application, handlers_aside):
             stack.enter_context(guard())
         find_launcher()
         plugin = importlib.import_module(
@@ -206,8 +206,8 @@ def end_sweep(config: DictConfig) -> None:
 
 
 @contextlib.contextmanager
-def _import_path() -> Iterator[None]:
-    """Let settings name modules of the working directory."""
+def working_directory_imports() -> Iterator[None]:
+    """Context: settings may name modules of the working directory."""
     before = sys.path[:]
     sys.path.insert(0, os.getcwd())
     try:
