@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from ..lanes.call import Given
 from ..lanes.emit.schedule import Schedule
 from ..lanes.row_independence import doubt
-from ..lanes.trace.graph import FLAG, ROW, STEP, WIDE, Graph
+from ..lanes.trace.graph import FLAG, NARROW, ROW, STEP, WIDE, Graph
 from ..lanes.trace.step import Traced, trace
 from ..lanes.trace.tracer import NotLoweredError
 from ..lanes.tree import Tree
@@ -186,7 +186,8 @@ class OnnxGraph:
 
     def _dtype(self, node: int) -> Any:
         kind = self.graph.type[node]
-        return np.dtype(bool) if kind == FLAG else np.dtype(np.float64) if kind == WIDE else self.real
+        known = {FLAG: np.dtype(bool), WIDE: np.dtype(np.float64), NARROW: np.dtype(np.float32)}
+        return known.get(kind, self.real)
 
     def _cast(self, value: str, dtype: Any) -> str:
         return self._emit("Cast", [value], to=self.onnx.helper.np_dtype_to_tensor_dtype(np.dtype(dtype)))
