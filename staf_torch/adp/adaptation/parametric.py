@@ -289,8 +289,9 @@ class ChangingPlant(ControlAffineSystem):
         Raises:
             ValueError: if the cost has a set-point or an output of its own.
         """
-        if cost.output is not None or cost.target is not None or self.periodic:
-            raise fail("ChangingPlant", "cost", "must be of x itself at the origin, without angles", cost)
+        if cost.output is not None or cost.target is not None:
+            raise fail("ChangingPlant", "cost", "must be of x itself at the origin", cost)
         own, wide = self.own, copied(cost)
         wide.dim, wide.output = self.size, lambda z: z[..., :own]
+        wide.periodic = ()  # until it is around this plant
         return wide

@@ -216,6 +216,22 @@ def test_a_covariance_that_shrank_below_rounding_does_not_stay_0(deviation: floa
         assert float(belief.mean[0, 0]) == pytest.approx(3.0, abs=1e-3)  # the mean of three
 
 
+def test_a_plant_that_changes_pays_for_angles_around_the_circle() -> None:
+    model = adp.ParametricPlant(
+        lambda x, u: torch.stack((torch.zeros_like(u), u), dim=-2),
+        lambda x, u: torch.stack((x[..., 1], 0 * x[..., 0]), dim=-1),
+        dim=2,
+        inputs=1,
+        theta=[1.0],
+        rows=[1],
+        periodic=(0,),
+    )
+    plant, cost = adp.ChangingPlant(model), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+    whole = plant.cost(cost.around(model)).around(plant)
+    z = plant.start(tensor([[0.3, 0.1], [0.3 + 6 * math.pi, 0.1]]), before=[1.0])
+    torch.testing.assert_close(whole.state_rate(z), tensor([0.1, 0.1]))
+
+
 def test_a_state_that_is_never_measured_is_found_by_the_model() -> None:
     filter, x, u = adp.ConsiderFilter(PENDULUM, noise=0.01), tensor([[0.1, 0.3]]), torch.zeros(1, 1).double()
     sure = adp.LeastSquares([0.1, 1.0], deviation=1e-6).init(x)
