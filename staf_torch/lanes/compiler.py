@@ -10,6 +10,7 @@ import os
 import platform
 import shlex
 import shutil
+import signal
 import subprocess
 import tempfile
 import threading
@@ -156,13 +157,18 @@ def _version(program: str) -> str:
 
 def _run(command: list[str]) -> str:
     seconds = float(os.environ.get("STAF_COMPILE_SECONDS", "120"))
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=seconds, check=False)
-    except subprocess.TimeoutExpired as error:
-        raise OSError(f"{command[0]} took more than {seconds:g} s (STAF_COMPILE_SECONDS)") from error
-    if done.returncode != 0:
-        raise OSError(f"{command[0]} failed: {done.stderr.strip() or done.returncode}")
-    return done.stdout
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, process_group=0) as process:
+        try:
+            out, err = process.communicate(timeout=seconds)
+        except BaseException as error:
+            os.killpg(process.pid, signal.SIGKILL)  # with what the driver has started, which works on else
+            if isinstance(error, subprocess.TimeoutExpired):
+                raise OSError(f"{command[0]} took more than {seconds:g} s (STAF_COMPILE_SECONDS)") from error
+            raise
+    if process.returncode != 0:
+        raise OSError(f"{command[0]} failed: {err.strip() or process.returncode}")
+    return out
 
 
 def _say(name: str, reason: str) -> None:

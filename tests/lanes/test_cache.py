@@ -7,6 +7,7 @@ import itertools
 import multiprocessing
 import os
 import shutil
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -159,6 +160,21 @@ def test_where_nothing_can_be_built_plain_torch_serves_and_one_line_says_why(
     assert reason in line
     assert "\n" not in line
     assert not list(cache.glob("*.so"))
+
+
+def test_what_a_compiler_that_takes_too_long_has_started_ends_with_it(
+    cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lines = '[ "$1" = --version ] && exit 0', f"sleep 60 & echo $! > {tmp_path / 'child'}; wait"
+    monkeypatch.setenv("CXX", str(script(tmp_path / "driver", *lines)))
+    monkeypatch.setenv("STAF_COMPILE_SECONDS", "0.5")
+    assert not new_program("a program").compiles(X, steps=2)
+    child = int((tmp_path / "child").read_text())
+    state = Path(f"/proc/{child}/stat")
+    deadline = time.monotonic() + 10
+    while state.exists() and state.read_text().split()[2] != "Z" and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert not state.exists() or state.read_text().split()[2] == "Z"
 
 
 def test_a_home_that_cannot_be_written_is_replaced_by_a_folder_of_the_process(
