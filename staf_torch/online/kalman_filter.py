@@ -27,12 +27,12 @@ class StreamState:
     u is the mean of the weights, I - D their covariance: D, 0 <= D <= I, is what has been learned. The rows
     of the table: the anchor, x as last measured, u output by output and of an output that is always 1, D's
     lower triangle row by row; for every output the root mean square of its standardised errors, how many in
-    a row were a surprise, how many were counted, mean and spread of y, its leaps in a row; then the running
-    share of V that was unknown, and the largest |y| learned. In memory the numbers of `LANES` streams stand
-    together, so that machine code reads them one after the other.
+    a row were a surprise, how many were counted, mean and spread of y, its leaps in a row, y as last measured;
+    then the running share of V that was unknown, and the largest |y| learned. In memory the numbers of `LANES`
+    streams stand together, so that machine code reads them one after the other.
     """
 
-    blocks: Tensor  # (ceil(S / LANES), 2 n + (K + 1) M + M (M + 1) / 2 + 6 K + 2, LANES)
+    blocks: Tensor  # (ceil(S / LANES), 2 n + (K + 1) M + M (M + 1) / 2 + 7 K + 2, LANES)
     counts: Tensor  # learned, skipped, out of proportion in a row, learned since it began: (4, S) int64
     dim: int  # n
     count: int  # M
@@ -83,7 +83,7 @@ class StreamState:
     def parts(self, table: Tensor) -> StateParts:
         """The rows of a table (..., S) by name: views, but for D."""
         n, m, k = self.dim, self.count, self.outputs
-        sizes = [n, n, (k + 1) * m, m * (m + 1) // 2, *[k] * 6, 1, 1]
+        sizes = [n, n, (k + 1) * m, m * (m + 1) // 2, *[k] * 7, 1, 1]
         anchor, last, mean, lower, *rest = table.split(sizes)
         row, column = torch.tril_indices(m, m, device=table.device)
         learned = table.new_empty(m, m, *table.shape[1:])
@@ -125,6 +125,7 @@ class StateParts(NamedTuple):
     level: Tensor  # running mean of y, (K, S)
     spread: Tensor  # running deviation of y from it, (K, S)
     leaps: Tensor  # in a row, of y from it, (K, S)
+    value: Tensor  # y as last measured, (K, S)
     usual: Tensor  # running share of the variance of V that was unknown at x, (1, S)
     largest: Tensor  # (1, S)
 
@@ -146,6 +147,7 @@ class _NewSample(NamedTuple):
     seen: Tensor  # whether it was, (K, S)
     lapse: Tensor  # (S,)
     fine: Tensor  # whether the stream learns, (S,)
+    stays: Tensor  # whether x is what it was, (S,)
     before: _Outlook  # before the centers moved
     most: float  # the largest number of the table
 
@@ -251,6 +253,7 @@ class LocalFilter:
         fine = sound & (~huge | afresh)
 
         z = torch.where(fine & ~afresh, x - old.anchor, 0.0)
+        stays = torch.eq(x, old.last).all(0)
         moves = fine & (afresh | ((z * z).sum(0) > self.slack**2))
         before = self._outlook(old, z, self.forgetting**lapse)
         anchor = torch.where(moves, x, old.anchor)
@@ -265,7 +268,7 @@ class LocalFilter:
         kept = old._replace(mean=mean, learned=learned)
         moved = StateParts(anchor, held, *(torch.where(afresh, 0.0, part) for part in kept[2:]))
         most = torch.finfo(state.dtype).max
-        found, good = self._update(moved, since, _NewSample(z, y, seen, lapse, fine, before, most))
+        found, good = self._update(moved, since, _NewSample(z, y, seen, lapse, fine, stays, before, most))
         faded = moved._replace(learned=moved.learned * self.forgetting**lapse)  # time passes in any case
         both = [torch.where(good, new, old_) for new, old_ in zip(found, faded, strict=True)]
         state.put(state.whole(StateParts(*both)))
@@ -274,7 +277,7 @@ class LocalFilter:
 
     def _update(self, old: StateParts, since: Tensor, sample: _NewSample) -> tuple[StateParts, Tensor]:
         """The Kalman update at z from the anchor; and the streams whose result is finite."""
-        z, y, seen, lapse, fine, before, most = sample
+        z, y, seen, lapse, fine, stays, before, most = sample
         (psi, log_factor), noise = self.functions.local(old.anchor, z), self.ratio
         largest = torch.maximum(old.largest, y.abs().amax(0))
         prior = torch.zeros_like(lapse) + self.functions.prior(old.anchor, z)
@@ -300,12 +303,16 @@ class LocalFilter:
         level, deviation, leaps, told = spread_with(
             y, old.level, old.spread, self._spread(old), old.leaps, old.told
         )
+        # a sample that repeats the last one says nothing of errors, unless all have been alike
+        says = seen & ~(stays & torch.eq(y, old.value) & (old.told >= 2))
         own = [
-            torch.where(seen, new.clamp(-most, most), old_)
+            torch.where(says, new.clamp(-most, most), old_)
             for new, old_ in zip((errors, surprises, told, level, deviation, leaps), old[4:10], strict=True)
         ]
+        own.append(torch.where(seen, y, old.value))
         rate = (1 / since.clamp(min=1).double()).clamp(min=ERROR_RATE)
-        usual = torch.where(since > 0, old.usual + rate * (before.unknown.nan_to_num(1.0) - old.usual), 0.0)
+        moved = old.usual + rate * (before.unknown.nan_to_num(1.0) - old.usual)
+        usual = torch.where(says.any(0), torch.where(since > 0, moved, 0.0), old.usual)
         good = fine & (spread > 0) & (mean.abs().amax((0, 1)) <= most) & torch.isfinite(learned.sum((0, 1)))
         return StateParts(old.anchor, old.last, mean, learned, *own, usual, largest), good
 
@@ -369,7 +376,7 @@ def _limited(value: Tensor, running: Tensor, row: Tensor, told: Tensor) -> tuple
 
 def rows_of(dim: int, count: int, outputs: int) -> int:
     """Return the rows of the table of a `StreamState`."""
-    return 2 * dim + (outputs + 1) * count + count * (count + 1) // 2 + 6 * outputs + 2
+    return 2 * dim + (outputs + 1) * count + count * (count + 1) // 2 + 7 * outputs + 2
 
 
 def _blocks(table: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ..kernels import GaussianKernel
-from .filter_streams import FilterStreams, total
+from .filter_streams import FilterStreams, units_of
 from .kalman_filter import LocalFilter, StreamState
 from .local_functions import LocalFunctions
 
@@ -27,6 +27,7 @@ SHORT = 0.35  # widths / sqrt(n), nearly what all of x covers of the widest: a c
 LITTLE = 6.0  # nats, log of the number of candidates: what is worth less may be luck of the best of them
 FAILS = 0.05  # share of samples that no candidate need explain
 BROAD = 3.0  # standard deviations of y: width of the density that explains these
+MOST = 1e100  # spreads from the center beyond which a value is none
 HARDLY = 0.02  # widths of the other coordinates: one that covers less hardly moves
 
 
@@ -70,12 +71,10 @@ def tuning(x: Tensor, y: Tensor, directions: Tensor) -> Tuning:
     """
     both = torch.cat((x, y), -1).double()
     seen = torch.isfinite(both)
-    count = seen.sum(0).clamp(min=1)
-    center = total(torch.where(seen, both, 0.0)) / count
-    spread = (total(torch.where(seen, both - center, 0.0).square()) / count).sqrt()
-    moves = spread > 1e-12 * center.abs()
-    spread = torch.where(moves, spread, 1.0)
+    units = units_of(torch.where(seen, both, torch.nan).flatten(1))
+    center, spread = (part.unflatten(0, both.shape[1:]) for part in units)
     samples = (both - center) / spread
+    samples = torch.where(samples.abs() < MOST, samples, torch.nan)
     n, streams = x.shape[-1], x.shape[1]
     widths = torch.tensor(WIDTHS, dtype=torch.float64) * math.sqrt(n)
     laws = (torch.tensor(each, dtype=torch.float64) for each in (NOISES, FORGETTING))
@@ -105,7 +104,30 @@ def tuning(x: Tensor, y: Tensor, directions: Tensor) -> Tuning:
     _warn(extent / width, width, wider)
     units = torch.cat((width, spread[:, n:]), 1)
     radii = torch.tensor(RADII, dtype=torch.float64)[which]
-    return Tuning(center, units, kept.noise**2, kept.forgetting, radii, score, stretch, unknown.double())
+    found_ = Tuning(center, units, kept.noise**2, kept.forgetting, radii, score, stretch, unknown.double())
+    return _untold(found_, samples[..., n:])
+
+
+def _untold(found: Tuning, y: Tensor) -> Tuning:
+    """Give streams with an output that has no second value here, (T, S, K), the defaults, and log it."""
+    apart = y.nan_to_num(nan=-torch.inf).amax(0) - y.nan_to_num(nan=torch.inf).amin(0)
+    silent = ~(apart > 0).all(1)
+    if not bool(silent.any()):
+        return found
+    _log.warning(
+        "`StaFRegressor.tune(y=...)`: an output of %d of %d stream(s) (first: %d) has no two different values "
+        "in this stretch: these streams keep the defaults and learn their units as they go",
+        *(int(silent.sum()), len(silent), int(silent.int().argmax())),
+    )
+    width, noise, forgetting = DEFAULT
+    lost = {"center": torch.nan, "spread": torch.nan, "ratio": noise**2}
+    lost |= {"forgetting": forgetting, "width": width, "unknown": 1.0}
+
+    def either(name: str, part: Tensor) -> Tensor:
+        which = silent.reshape(-1, *[1] * (part.dim() - 1))
+        return torch.where(which, lost.get(name, part), part)
+
+    return Tuning(**{name: either(name, part) for name, part in found._asdict().items()})
 
 
 def tuned_streams(

@@ -132,7 +132,7 @@ static void carry(const Rules &r, Stream &s, const double *x, const double *y, d
             f.learned[i] = verdict.moves ? (verdict.afresh ? V{} : moved.learned[i]) : f.learned[i];
     }
     auto get = [&](int i) { return f.learned[i]; };
-    update(r.functions, law, f, get, [&](int i, V value) { f.learned[i] = value; }, z, value, seen, all(lapse), verdict.fine,
+    update(r.functions, law, f, get, [&](int i, V value) { f.learned[i] = value; }, z, value, seen, all(lapse), verdict.fine, verdict.stays,
            verdict.moves & ~verdict.afresh, before);
     std::memcpy(s.filters, &f, sizeof f);
 }

@@ -15,7 +15,7 @@ struct Call {
 };
 constexpr int tile = 64;  // streams that are worked on together stay in the cache
 constexpr int row_mean = 2 * n, row_learned = row_mean + (K + 1) * M, row_errors = row_learned + M * (M + 1) / 2;
-constexpr int rows_of_all = row_errors + 6 * K + 2, expectations = K + 2;
+constexpr int rows_of_all = row_errors + 7 * K + 2, expectations = K + 2;
 
 typedef REAL Stored __attribute__((vector_size(lanes * sizeof(REAL))));
 INLINE REAL *block_of(const Call &call, int64_t first) { return call.table + first * rows_of_all; }
@@ -201,7 +201,7 @@ static void learn(const Call &call) {
             auto put = [&](int row, V value) { save(block + row * lanes, value); };
             const Mask good = update(
                 call.functions, law_of(call, first, count), s, [&](int i) { return load(learned + i * lanes); },
-                [&](int i, V value) { save(learned + i * lanes, value); }, z, y, seen, lapse, v.fine,
+                [&](int i, V value) { save(learned + i * lanes, value); }, z, y, seen, lapse, v.fine, v.stays,
                 v.moves & ~v.afresh, expected + (first - begin) / lanes * expectations);
             for (int o = 0; o <= K; ++o)
                 for (int i = 0; i < M; ++i) put(row_mean + o * M + i, s.mean[o][i]);

@@ -80,7 +80,7 @@ struct Functions {  // of local_functions.py, in float64
 
 struct Filter {  // of lanes streams
     V anchor[n], last[n], mean[K + 1][M], learned[M * (M + 1) / 2];  // D's lower triangle
-    V errors[K], surprises[K], told[K], level[K], spread[K], leaps[K], usual, largest, since;
+    V errors[K], surprises[K], told[K], level[K], spread[K], leaps[K], value[K], usual, largest, since;
 };
 
 struct Law {
@@ -223,7 +223,7 @@ INLINE void predict(const Functions &f, const Law &law, const Filter &s, Get lea
 }
 
 struct Verdict {  // on a sample
-    Mask fine, afresh, moves;
+    Mask fine, afresh, moves, stays;  // stays: x is what it was
     V streak, z[n];
 };
 
@@ -252,7 +252,8 @@ INLINE Verdict judge(const Law &law, Filter &s, V *x, V *y, Mask *seen, V streak
         sum += v.z[i] * v.z[i];
     }
     v.moves = v.fine & (v.afresh | (sum > law.slack2));
-    for (int i = 0; i < n; ++i) s.last[i] = finite(x[i]) ? x[i] : s.last[i];
+    v.stays = Mask{} == Mask{};
+    for (int i = 0; i < n; ++i) v.stays &= x[i] == s.last[i], s.last[i] = finite(x[i]) ? x[i] : s.last[i];
     if (any(v.afresh))
         for (V *part = s.errors; part <= &s.since; ++part) *part = v.afresh ? V{} : *part;
     return v;
@@ -289,7 +290,7 @@ INLINE void learn_scales(const Law &law, Filter &s, int o, V y, V away, V weight
 // have moved, `before` has what was expected before they did, and the unknown share behind it.
 template <typename Get, typename Put>
 INLINE Mask update(const Functions &f, const Law &law, Filter &s, Get learned, Put put, const V *z, const V *y,
-                   const Mask *seen, V lapse, Mask fine, Mask moved, const V *before) {
+                   const Mask *seen, V lapse, Mask fine, Mask stays, Mask moved, const V *before) {
     V psi[M], known[M]{}, gain[M], left[K + 1], expected[K + 1], kept[K], away[K], spread = 1. + law.ratio, share, total{}, peak{};
     functions_at(f, z, psi);
     share = lapse == 1. ? law.forgetting : V{};
@@ -340,9 +341,14 @@ INLINE Mask update(const Functions &f, const Law &law, Filter &s, Get learned, P
     }
     const Mask good = fine & (spread > 0.) & (total == 0.) & finite(spread) & (peak <= law.most);
     s.largest = good ? size : s.largest;
-    for (int o = 0; o < K; ++o) learn_scales(law, s, o, y[o], away[o], view.weight[o], good & seen[o]);
+    Mask some{};
+    for (int o = 0; o < K; ++o) {  // a sample that repeats the last one says nothing of errors, unless all have been alike
+        const Mask says = good & seen[o] & ~(stays & (y[o] == s.value[o]) & (s.told[o] >= 2.));
+        learn_scales(law, s, o, y[o], away[o], view.weight[o], says);
+        s.value[o] = good & seen[o] ? y[o] : s.value[o], some |= says;
+    }
     const V followed = maximum(1. / maximum(s.since, all(1)), all(error_rate));
-    s.usual = good ? (s.since > 0. ? s.usual + followed * (unknown - s.usual) : V{}) : s.usual;
+    s.usual = some ? (s.since > 0. ? s.usual + followed * (unknown - s.usual) : V{}) : s.usual;
     s.since = good ? s.since + 1. : s.since;
     for (int o = 0; o <= K; ++o)
         for (int i = 0; i < M; ++i) s.mean[o][i] = good ? next[o][i] : s.mean[o][i];
