@@ -16,9 +16,10 @@ from ..kernels import NAMED, Kernel
 from ..numerics.checks import choice, fail, flag, integer, positive_real, real
 from .estimator import StreamEstimator
 from .filter_streams import FilterStreams
-from .kalman_filter import LocalFilter, StreamState, smooth_record
+from .kalman_filter import LocalFilter, StreamState
 from .local_functions import LocalFunctions
 from .samples import lapses, like_given, pair, tensor_of
+from .smoothing import smooth_record
 from .tuning import Tuning, tuned_streams, tuning
 
 _log = logging.getLogger(__name__)

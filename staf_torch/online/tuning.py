@@ -109,14 +109,14 @@ def tuning(x: Tensor, y: Tensor, directions: Tensor) -> Tuning:
 
 
 def _untold(found: Tuning, y: Tensor) -> Tuning:
-    """Give streams with an output that has no second value here, (T, S, K), the defaults, and log it."""
+    """Give streams with an output that has one value here or none, (T, S, K), the defaults; log it."""
     apart = y.nan_to_num(nan=-torch.inf).amax(0) - y.nan_to_num(nan=torch.inf).amin(0)
     silent = ~(apart > 0).all(1)
     if not bool(silent.any()):
         return found
     _log.warning(
-        "`StaFRegressor.tune(y=...)`: an output of %d of %d stream(s) (first: %d) has no two different values "
-        "in this stretch: these streams keep the defaults and learn their units as they go",
+        "`StaFRegressor.tune(y=...)`: an output of %d of %d stream(s) (first: %d) has no two different "
+        "values in this stretch: these streams keep the defaults and learn their units as they go",
         *(int(silent.sum()), len(silent), int(silent.int().argmax())),
     )
     width, noise, forgetting = DEFAULT
