@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ..adp import LQR, Feedback, LoopResult, QuadraticCost, SafetyFilter
 from ..adp.loop.controller import Policy
-from ..adp.safety.safety_filter import Constraint
+from ..adp.safety.conditions import Constraint
 from ..figures.animation import Curves, Scene
 from ..figures.closed_loop import AvoidanceHistory, draw_avoidance
 from ..metrics.safety import constraint_metrics

@@ -14,7 +14,8 @@ from ...numerics.checks import fail, positive_real, vector
 from ..loop.controller import Carried, Controller
 from ..planning.ddp import chosen
 from ..safety.quadratic_program import nearest_admissible
-from ..safety.safety_filter import Constraint, SafetyFilter, listed
+from ..safety.conditions import Constraint, listed
+from ..safety.safety_filter import SafetyFilter
 from .least_squares import Estimate, LeastSquares
 from .parametric import ChangingPlant, ParametricPlant
 from .windows import IntegralWindows, Window

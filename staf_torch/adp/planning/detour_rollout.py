@@ -15,7 +15,7 @@ from ...systems import Plant
 from ..loop.controller import Controller, Policy, Value
 from ..problem.cost import Cost
 from ..problem.held_plant import Holding
-from ..safety.safety_filter import Constraint, check_traceable, listed
+from ..safety.conditions import Constraint, check_traceable, listed
 
 _AXES = 4  # at most: their combinations are 3^k - 1
 _AROUND = (0.2, 0.07)  # by which the detour of the period before is varied, in units of the axes

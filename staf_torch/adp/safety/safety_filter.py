@@ -2,32 +2,36 @@
 
 from __future__ import annotations
 
-import functools
+import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from ...lanes import compiled, repeat
-from ...numerics.checks import fail, non_negative, one_or_each, positive, positive_real, trailing
-from ...systems import Bounds, Plant, StepPlant
+from ...lanes import compiled, repeat, where_rows
+from ...numerics.checks import fail, one_or_each, positive, positive_real, trailing
+from ...systems import Bounds, Plant
 from ...systems.bounds import Limit
 from ..loop.controller import Carried, Controller, Feedback, Policy
 from ..loop.simulation import LoopResult
-from ..problem.held_plant import Holding
+from .conditions import Conditions, Constraint, Lean, check_traceable, listed
+from .look_ahead import LookAhead
 from .quadratic_program import cases, nearest_admissible
 
-Constraint = Callable[[Tensor, Tensor], Tensor]
-"""h(x, t), kept at least 0: states (B, n) and a time, a number in a tensor (), to (B,)."""
-RowValue = Callable[[Tensor, Tensor], Tensor]
-"""A function of one row (1, n) and a time () to a number ()."""
+_log = logging.getLogger(__name__)
 INFEASIBLE = 1e-6  # slack, in units of the input, from which on a row counts as infeasible
 _PASSES, _MOST = 2, 8  # linearisations at least, the first at the wanted control; at most, until all is met
 _SOLVED = 1e-6  # of what a wanted control misses, at which it is
-_PROBES, _TIMES = 32, (0.0, 0.1, 1.0, 10.0, 100.0)  # states and times (s) at which constraints are tried
-_NOTHING = 1e-9  # of the slopes that make it, below which the effect of a control counts as none
+_OPPOSED = (
+    "`SafetyFilter`: braking along constraint %d drives the rest of the plant away, at %.3g 1/s near its "
+    "equilibrium (a coordinate that must first move the wrong way): %s. Plan instead: `AvoidanceCost` with "
+    "`RecedingHorizon`, see adp/safety/README.md."
+)
+_FOLLOWS = "the policy is left alone wherever it stays inside by itself, and what it cannot keep is `infeasible`"
+_TOPPLES = "the filter acts nevertheless, as nothing tells what a policy that remembers would do"
+_SLACK = 1e-9  # in units of the input, from which on the brakes are asked whether they do
 
 
 class Filtered(NamedTuple):
@@ -35,7 +39,8 @@ class Filtered(NamedTuple):
 
     control: Tensor  # (..., m)
     margin: Tensor  # h of every constraint now, (..., k)
-    slack: Tensor  # (...) how much further u would have to reach, in its (weighted) units; 0: all is met
+    slack: Tensor  # (...) how much further u would have to reach, in its (weighted) units; 0: all is kept
+    astray: Tensor  # (...) 1 where braking along the edge is no way, and the policy was followed ahead
 
 
 class Watched(NamedTuple):
@@ -46,6 +51,7 @@ class Watched(NamedTuple):
     least_margin: Tensor  # smallest h so far, (B,)
     largest_slack: Tensor  # (B,)
     acted: Tensor  # steps with another control than the wanted one, (B,)
+    astray: Tensor  # steps in which the barrier's condition was no guide, (B,)
 
 
 class SafetyFilter(Controller):
@@ -56,10 +62,10 @@ class SafetyFilter(Controller):
         phi = h (relative degree one),  phi = h' + decay h (relative degree two, h' along the plant).
 
     That is the exponential control barrier function of a control that is held: x(t + dt; u) is the plant
-    itself, integrated as everywhere, linearised in u where it was found, until what u must satisfy it
-    satisfies. What phi dips between the samples, which its value in the middle of the hold shows, is kept
-    as a margin, so that phi and with it h stay positive in between too. In the limit of a short hold the
-    condition is phi' >= -decay phi. The quadratic
+    itself, by Runge-Kutta steps, linearised in u where it was found, until what u must satisfy it satisfies.
+    What phi dips between the samples, which
+    its value in the middle of the hold shows, is kept as a margin, so that phi and with it h stay
+    positive in between too. In the limit of a short hold the condition is phi' >= -decay phi. The quadratic
     program is solved exactly: in closed form for one input, else by comparing all cases.
 
     A wanted control that satisfies everything is applied bit for bit. Bounds are hard; where they and the
@@ -109,7 +115,7 @@ class SafetyFilter(Controller):
         dt: float,
         low: Limit = None,
         high: Limit = None,
-        decay: float | Sequence[float] = 2.0,
+        decay: float | Sequence[float] | None = None,
         degree: int | Sequence[int] | None = None,
         margin: float | Sequence[float] = 0.0,
         weight: Sequence[float] | None = None,
@@ -124,25 +130,29 @@ class SafetyFilter(Controller):
         count = len(self.constraints)
         own = Bounds(low, high, plant.inputs)
         self.bounds = plant.bounds if not own.present and plant.bounds is not None else own
-        rates = one_or_each("SafetyFilter", "decay", decay, count)
-        self.register_buffer("decay", positive("SafetyFilter", "decay", rates))
-        kept = one_or_each("SafetyFilter", "margin", margin, count)
-        self.register_buffer("margin", non_negative("SafetyFilter", "margin", kept))
+        self.conditions = Conditions(plant, self.constraints, self.bounds, self.hold, decay, degree, margin)
+        self.degree, self.moving = self.conditions.degree, self.conditions.moving
         heavy = one_or_each("SafetyFilter", "weight", 1.0 if weight is None else weight, plant.inputs)
         positive("SafetyFilter", "weight", heavy)
         self.register_buffer("unit", heavy.rsqrt())
-        self.decay: Tensor  # (k,) 1/s
-        self.margin: Tensor  # (k,)
         self.unit: Tensor  # (m,) of an input, in which distances are measured
         low_, high_ = self.bounds.low / self.unit, self.bounds.high / self.unit
         self.register_buffer("table", cases(count, low_.tolist(), high_.tolist()))
         self.table: Tensor
-        self.holding = Holding("SafetyFilter", plant, None, 0.5 * self.hold)
-        self.degree, self.moving = self._probe(degree)
-        second = torch.tensor(self.degree, dtype=torch.int64) == 2
-        if bool((second & (self.decay * self.hold > 1)).any()):
-            rule = f"must be at most 1/dt = {1 / self.hold:g} where the relative degree is two"
-            raise fail("SafetyFilter", "decay", rule, decay)
+        self.ahead = LookAhead(self.conditions, self._policy)
+        for k, rate in enumerate(self.ahead.against.tolist()):
+            if rate > 0:
+                _log.warning(_OPPOSED, k, rate, _FOLLOWS if self.ahead.by_policy else _TOPPLES)
+
+    @property
+    def decay(self) -> Tensor:
+        """1/s, one a constraint."""
+        return self.conditions.decay
+
+    @property
+    def _policy(self) -> Policy | None:
+        """The policy, where it remembers nothing."""
+        return self.controller.policy if isinstance(self.controller, Feedback) else None
 
     @property
     def label(self) -> str:
@@ -178,13 +188,14 @@ class SafetyFilter(Controller):
         if t is None and self.moving:
             raise fail("SafetyFilter", "t", "must be given: a constraint depends on the time", t)
         time = torch.as_tensor(0.0 if t is None else t).to(x).expand(x.shape[:-1])
-        found = self._nearest(torch.cat((x, u, time.unsqueeze(-1)), dim=-1))
-        control, margin, slack = found.split((u.shape[-1], len(self.constraints), 1), dim=-1)
-        return Filtered(control, margin, slack.squeeze(-1))
+        found, k = self._nearest(torch.cat((x, u, time.unsqueeze(-1)), dim=-1)), len(self.constraints)
+        control, margin, more = found.split((m := u.shape[-1], k, found.shape[-1] - m - k), dim=-1)
+        astray = more[..., 1] if self.ahead.opposed else torch.zeros_like(time)
+        return Filtered(control, margin, more[..., 0], astray)
 
     def init(self, x0: Tensor) -> Watched:
         none = x0.new_zeros(len(x0))
-        return Watched(self.controller.init(x0), none, none + math.inf, none.clone(), none.clone())
+        return Watched(self.controller.init(x0), none, none + math.inf, *(none.clone() for _ in range(3)))
 
     def recorded(self, carried: Watched) -> dict[str, Tensor]:
         inner, *own = carried
@@ -193,22 +204,19 @@ class SafetyFilter(Controller):
     def step(self, x: Tensor, carried: Watched, uniform: Tensor, dt: float) -> tuple[Tensor, Watched]:
         if dt != self.hold:
             raise fail("SafetyFilter", "dt", f"must be that of the loop, {dt:g} s", self.hold)
-        inner, steps, least, most, acted = carried
+        inner, steps, least, most, acted, astray = carried
         u, inner = self.controller.step(x, inner, uniform, dt)
         found = self.restrain(x, u, steps * self.hold)
         least, most = torch.minimum(least, found.margin.amin(-1)), torch.maximum(most, found.slack)
         acted = acted + (found.control != self.bounds.clip(u)).any(-1)
-        return found.control, Watched(inner, steps + 1, least, most, acted)
+        return found.control, Watched(inner, steps + 1, least, most, acted, astray + found.astray)
 
     def value(self, x: Tensor, recorded: Mapping[str, Tensor]) -> Tensor | None:
         return self.controller.value(x, recorded)
 
     def margins(self, x: Tensor, t: float | Tensor = 0.0) -> Tensor:
         """h of every constraint: (..., n) and a number or (...) -> (..., k)."""
-        time = torch.as_tensor(t).to(x).expand(x.shape[:-1]).reshape(-1)
-        rows = x.reshape(-1, x.shape[-1])
-        columns = [torch.func.vmap(h)(rows.unsqueeze(1), time) for h in map(_number, self.constraints)]
-        return torch.stack(columns, dim=-1).reshape(*x.shape[:-1], -1)
+        return self.conditions.margins(x, t)
 
     def report(self, result: LoopResult) -> dict[str, Any]:
         """Report the constraints in a closed loop of this filter, over all of its steps.
@@ -219,53 +227,74 @@ class SafetyFilter(Controller):
             condition at a time; ``largest_slack``; ``acted``, the share of the steps in which the control was
             another than the wanted one within the bounds.
         """
-        steps, least, most, acted = (result[name][:, -1] for name in Watched._fields[1:])
+        steps, least, most, acted, astray = (result[name][:, -1] for name in Watched._fields[1:])
         last = self.margins(result.state[:, -1], steps * self.hold).amin(-1)
         least = torch.minimum(least, last)
         return {
             "minimum_margin": float(least.min()),
             "constraint_violations": int((least < 0).sum()),
-            "infeasible": (most > INFEASIBLE).nonzero().flatten().tolist(),
+            "infeasible": ((most > INFEASIBLE) | (least < 0)).nonzero().flatten().tolist(),
             "largest_slack": float(most.max()),
             "acted": float(acted.sum() / steps.sum()),
+            "astray": (astray > 0).nonzero().flatten().tolist(),
         }
 
     def inequalities(self, x: Tensor, u: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """a_i, c_i and h_i of the condition a_i'u >= c_i, linearised at u: (B, n), (B, m), (B,) ->
         (B, k, m), (B, k), (B, k)."""
-        normal, least, margin = self._every(self._inequality, x, u, t)
+        normal, least, margin = self.conditions.every(self.conditions.inequality, x, u, t)
         return normal[:, :, 0], least, margin
-
-    def _every(self, of: Callable[..., tuple[Tensor, ...]], x: Tensor, u: Tensor, t: Tensor) -> list[Tensor]:
-        """Evaluate a function of (k, x, u, t), one row, for every constraint: (B, k, ...) each."""
-        rows = [functools.partial(of, k) for k in range(len(self.constraints))]
-        parts = [torch.func.vmap(row)(x.unsqueeze(1), u.unsqueeze(1), t) for row in rows]
-        return [torch.stack(column, dim=1) for column in zip(*parts, strict=True)]
 
     @compiled("a safety filter")
     def _nearest(self, z: Tensor) -> Tensor:
-        """u, margins and slack of rows of (x, u, t): (..., n + m + 1) -> (..., m + k + 1)."""
+        """u, margins, slack and astray of rows of (x, u, t): (..., n + m + 1) -> (..., m + k + 2)."""
         n, m = self.plant.equilibrium().numel(), self.plant.inputs
         flat = z.reshape(-1, z.shape[-1])
         x, wanted, t = flat[:, :n], flat[:, n : n + m], flat[:, n + m]
-        unit = self.unit.to(x)
-        low, high = self.bounds.low.to(x) / unit, self.bounds.high.to(x) / unit
-        first = torch.minimum(torch.maximum(wanted / unit, low), high)
-        at = torch.where(
-            ((wanted >= self.bounds.low.to(x)) & (wanted <= self.bounds.high.to(x))), wanted, first * unit
-        )
-
-        shortfall, margin = self._every(self._shortfall, x, at, t)
+        low, high = self.bounds.low.to(x), self.bounds.high.to(x)
+        unit, of = self.unit.to(x), self.conditions
+        first = torch.minimum(torch.maximum(wanted / unit, low / unit), high / unit)
+        at = torch.where((wanted >= low) & (wanted <= high), wanted, first * unit)
+        shortfall, margin, strain = of.every(of.shortfall, x, at, t)
         asked = shortfall.amax(-1)
-        met = asked <= 0  # needs neither slopes nor a quadratic program
-        none = torch.zeros_like(t)
+        u, slack = self._linearised(x, at, first, t, asked)
+        astray = torch.zeros_like(slack)
+        if self.ahead.acts:
+            look = slack > _SLACK
+            if not of.apart:
+                look = look | self.ahead.asked(x, u, t, strain.amax(-1))
+            if self.ahead.opposed:
+                look = look | (asked > 0)
+                astray = look.to(x)
+            elif self.ahead.weak:
+                look = t == t
+            chosen = self.ahead.choose(self._policy, (at, u, x, t), look)
+            missing = where_rows(chosen.left < 0, self._lacking, (x, t, -chosen.left), slack)
+            u = torch.where(look.unsqueeze(-1), chosen.control, u)
+            # A barrier of degree two that the bounds cannot meet is no loss where the brakes do.
+            forgiven = slack if 1 in self.degree and not self.ahead.opposed else torch.zeros_like(slack)
+            after = torch.where(chosen.left < 0, torch.maximum(slack, missing), forgiven)
+            slack = torch.where(look, after, slack)
+        outside = -margin.amin(-1)
+        missing = where_rows(outside > 0, self._lacking, (x, t, outside), slack)
+        slack = torch.where(outside > 0, torch.maximum(slack, missing), slack)
+        more = (slack, astray) if self.ahead.opposed else (slack,)
+        found = torch.cat((u, margin, torch.stack(more, dim=-1)), dim=-1)
+        return found.reshape(*z.shape[:-1], -1)
+
+    def _linearised(
+        self, x: Tensor, at: Tensor, first: Tensor, t: Tensor, asked: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """The nearest u that meets the conditions, by lines at the u before, and what it misses."""
+        unit, none, of = self.unit.to(x), torch.zeros_like(t), self.conditions
+        low, high = self.bounds.low.to(x) / unit, self.bounds.high.to(x) / unit
 
         def linearise(now: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
             u, best, slack, least, passes, _ = now
             normal, required, _ = self.inequalities(x, u, t)
             found = nearest_admissible(first, normal * unit, required, low, high, self.table)
             u, passes = found.point * unit, passes + 1
-            missing, _ = self._every(self._shortfall, x, u, t)
+            missing, *_ = of.every(of.shortfall, x, u, t)
             left = missing.amax(-1)
             unmet = left > _SOLVED * asked
             # Where a line is a poor likeness: what is still missing, along its slope.
@@ -278,123 +307,19 @@ class SafetyFilter(Controller):
             again = (passes < _PASSES) | (unmet & (passes < _MOST))
             return u, best, slack, least, passes, again
 
-        start = at, at, none, none, none, ~met
+        start = at, at, none, none, none, asked > 0
         _, u, slack, *_ = repeat(_MOST, linearise, start, where=lambda now: now[5])
-        return torch.cat((u, margin, slack.unsqueeze(-1)), dim=-1).reshape(*z.shape[:-1], -1)
+        return u, slack
 
-    def _shortfall(self, k: int, x: Tensor, u: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-        """Return how far phi misses its condition with u held, and h now: (1, n), (1, m), () -> (), ()."""
-        end, middle = self._held(k, x, u, t)
-        return self._required(k, x, t, end, middle) - end, _number(self.constraints[k])(x, t)
-
-    def _inequality(self, k: int, x: Tensor, u: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Linearise one constraint for one row: (1, n), (1, m), () -> (1, m), (), ()."""
-
-        def held(u: Tensor) -> tuple[Tensor, Tensor]:
-            return self._held(k, x, u, t)
-
-        slope, (end, middle) = torch.func.grad_and_value(held, has_aux=True)(u)
-        required = self._required(k, x, t, end, middle)
-        miss = (required - end + (slope * u).sum()) / self.hold
-        return slope / self.hold, miss, _number(self.constraints[k])(x, t)
-
-    def _held(self, k: int, x: Tensor, u: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-        """phi at the end of the hold, and in its middle."""
-        phi, middle = self._level(k), self._advance(x, u)
-        return phi(self._advance(middle, u), t + self.hold), phi(middle, t + 0.5 * self.hold)
-
-    def _required(self, k: int, x: Tensor, t: Tensor, end: Tensor, middle: Tensor) -> Tensor:
-        """Return the least phi at the end."""
-        now = self._level(k)(x, t)
-        dip = 0.5 * (now + end) - middle
-        dip = torch.where(dip > 0, dip, 0.0)
-        return dip + torch.exp(-self.decay[k].to(x) * self.hold) * (now - dip)
-
-    def _advance(self, x: Tensor, u: Tensor) -> Tensor:
-        """x after half a hold."""
-        return self.holding(x, u)[0]
-
-    def _level(self, k: int) -> RowValue:
-        """phi of one row: (1, n), () -> ()."""
-        h = _number(self.constraints[k])
-        if self.degree[k] == 1:
-            return lambda x, t: h(x, t) - self.margin[k].to(x)
-        rest = self.plant.resting_input()
-
-        def level(x: Tensor, t: Tensor) -> Tensor:
-            falls = self.decay[k].to(x) * (h(x, t) - self.margin[k].to(x))
-            return _rate(h, self.plant, x, rest.to(x).unsqueeze(0), t) + falls
-
-        return level
-
-    def _probe(self, degree: int | Sequence[int] | None) -> tuple[tuple[int, ...], bool]:
-        """The relative degrees, and whether a constraint depends on the time."""
-        generator = torch.Generator().manual_seed(0)
-        around = torch.randn(_PROBES, self.plant.dim or 0, dtype=torch.float64, generator=generator)
-        x = (self.plant.equilibrium() + around).repeat(len(_TIMES), 1)
-        t = torch.tensor(_TIMES, dtype=torch.float64).repeat_interleave(_PROBES)
-        for k, h in enumerate(self.constraints):
-            shape = tuple(h(x[:3], t[0]).shape)
-            if shape != (3,):
-                raise fail("SafetyFilter", "constraints", f"must map (3, n) to (3,), number {k}", shape)
-        values = self.margins(x, t).unflatten(0, (len(_TIMES), _PROBES))
-        moving = bool((values != values[:1]).any())
-        if degree is not None:
-            given = [degree] * len(self.constraints) if isinstance(degree, int) else list(degree)
-            if len(given) != len(self.constraints) or not set(given) <= {1, 2}:
-                raise fail("SafetyFilter", "degree", "must be 1 or 2, one a constraint", degree)
-            return tuple(given), moving
-        found = [self._degree(_number(h), x.unsqueeze(1), t) for h in self.constraints]
-        if 0 in found:
-            raise ValueError(
-                f"`SafetyFilter(constraints=...)`: the control moves neither first nor second derivative "
-                f"of number {found.index(0)}, at {len(x)} states around the equilibrium. A relative degree "
-                "of three and more needs another h; one that is flat there needs its `degree`."
-            )
-        return tuple(found), moving
-
-    def _degree(self, h: RowValue, x: Tensor, t: Tensor) -> int:
-        """1 or 2: which derivative of h the control moves at states (P, 1, n); 0 for neither."""
-        rest = self.plant.resting_input().double().unsqueeze(0)
-
-        def first(x: Tensor, t: Tensor) -> Tensor:
-            return _rate(h, self.plant, x, rest, t)
-
-        for number, phi in ((1, h), (2, first)):
-
-            def rate(u: Tensor, x: Tensor, t: Tensor, phi: RowValue = phi) -> Tensor:
-                return _rate(phi, self.plant, x, u, t)
-
-            effect = torch.func.vmap(torch.func.grad(rate), in_dims=(None, 0, 0))(rest, x, t)
-            if bool((effect.abs() > _NOTHING).any()):
-                return number
-        return 0
-
-
-def listed(call: str, constraints: Constraint | Sequence[Constraint]) -> list[Constraint]:
-    """The constraints as a list, refused in the name of ``call`` where they are no functions."""
-    several = [constraints] if callable(constraints) else list(constraints)
-    if not several or not all(map(callable, several)):
-        raise fail(call, "constraints", "must be h(x, t) or a list of them", constraints)
-    return several
-
-
-def check_traceable(call: str, plant: Plant) -> None:
-    """Refuse a plant in discrete time, or with what torch cannot see into."""
-    if isinstance(plant, StepPlant) or not isinstance(plant, Plant) or not plant.traceable:
-        raise fail(call, "plant", "must be in continuous time and torch all through", plant)
-
-
-def _number(h: Constraint) -> RowValue:
-    """h of one row: (1, n), () -> ()."""
-    return lambda x, t: h(x, t)[0]
-
-
-def _rate(phi: RowValue, plant: Plant, x: Tensor, u: Tensor, t: Tensor) -> Tensor:
-    """d phi / dt along the plant: (1, n), (1, m), () -> ()."""
-    along_x, along_t = torch.func.grad(phi, argnums=(0, 1))(x, t)
-    rate: Tensor = (along_x * plant.motion(x, u)).sum() + along_t
-    return rate
+    def _lacking(self, given: tuple[Tensor, ...]) -> Tensor:
+        """What u would have to reach further to win so much of h within the hold, more than `INFEASIBLE`."""
+        x, t, short = given
+        lean = Lean(*self.conditions.every(self.conditions.lean, x, t))
+        second = torch.tensor(self.degree, device=x.device) == 2
+        effect = (lean.slope * self.unit.to(x)).square().sum(-1).sqrt()
+        effect = (effect * torch.where(second, 0.5 * self.hold**2, self.hold)).amax(-1)
+        further = short / torch.where(effect > 0, effect, 1.0)
+        return torch.where(further > 2 * INFEASIBLE, further, 2 * INFEASIBLE)
 
 
 def walls(low: Sequence[float], high: Sequence[float]) -> list[Constraint]:

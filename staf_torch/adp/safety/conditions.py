@@ -1,0 +1,390 @@
+"""Conditions on a held control that keep h(x, t) >= 0: the barrier's, the stop's, and what the brakes can do.
+
+The barrier condition of relative degree two, phi' >= -decay phi with phi = h' + decay h, keeps h >= 0 only
+where phi >= 0 holds already and the bounds can go on meeting it. Where phi < 0 the state comes nearer faster
+than decay allows: then the constant deceleration that stops it at the edge, v^2 / 2h, is asked for as well.
+Where bounds limit h'' the speed must stay one that they can stop, v^2 <= 2 a h.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from ...numerics.checks import fail, non_negative, one_or_each, positive
+from ...numerics.runge_kutta import runge_kutta_step
+from ...systems import Bounds, Plant, StepPlant
+
+Constraint = Callable[[Tensor, Tensor], Tensor]
+"""h(x, t), kept at least 0: states (B, n) and a time, a number in a tensor (), to (B,)."""
+RowValue = Callable[[Tensor, Tensor], Tensor]
+"""A function of one row (1, n) and a time () to a number ()."""
+_PROBES, TIMES = 32, (0.0, 0.1, 1.0, 10.0, 100.0)  # states and times (s) at which constraints are tried
+_NOTHING = 1e-9  # of the slopes that make it, below which the effect of a control counts as none
+_RESERVE = 1e-3  # share of a distance, and of the brakes, that a stop leaves
+_PERIODS = 5.0  # in which h falls by 1/e at the fastest decay that is chosen without being asked for
+_CAREFUL, _RARE = 0.5, 0.1  # a stop is looked into from this share of that quantile of the brakes on
+_SEVERAL = 1 / 3  # of the edges tried, on which brakes that cannot hold h make a constraint a weak one
+
+
+class Lean(NamedTuple):
+    """What moves a constraint at a state: its last derivative before the inputs, and what they add."""
+
+    value: Tensor  # h - margin, (B, k)
+    rate: Tensor  # h' at the resting input, 0 where the degree is one
+    drift: Tensor  # derivative of h (degree one) or of its rate (two) at the resting input
+    slope: Tensor  # of that in the inputs, (B, k, m)
+    ability: Tensor  # the largest one within the bounds, (B, k)
+
+
+class Ends(NamedTuple):
+    """A constraint over a hold: at its beginning and end; of one row () each, of all (B, k)."""
+
+    value: Tensor
+    rate: Tensor
+    between: Tensor  # the value in the middle
+    last_value: Tensor
+    last_rate: Tensor
+    last_slope: Tensor  # the square of the gradient of h
+
+    def least(self, hold: float | Tensor) -> Tensor:
+        """The smallest value after the beginning, by the parabola where the rate changes its sign."""
+        turns = (self.rate < 0) & (self.last_rate > 0)
+        bend = torch.where(turns, self.last_rate - self.rate, 1.0)
+        summit = torch.where(
+            turns, self.value - 0.5 * hold * self.rate.square() / bend, self.last_value
+        )
+        return torch.minimum(torch.minimum(summit, self.between), self.last_value)
+
+
+class Conditions(nn.Module):
+    """What a held control must satisfy to keep h_i(x, t) >= margin_i, one row and constraint at a time.
+
+    Args:
+        plant, constraints, bounds, hold, decay, degree, margin: as in `SafetyFilter`.
+
+    Raises:
+        ValueError: if one breaks its rule.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        constraints: Sequence[Constraint],
+        bounds: Bounds,
+        hold: float,
+        decay: float | Sequence[float] | None,
+        degree: int | Sequence[int] | None,
+        margin: float | Sequence[float],
+    ) -> None:
+        super().__init__()
+        self.plant, self.constraints, self.bounds, self.hold = plant, list(constraints), bounds, hold
+        count = len(self.constraints)
+        kept = one_or_each("SafetyFilter", "margin", margin, count)
+        self.register_buffer("margin", non_negative("SafetyFilter", "margin", kept))
+        self.register_buffer("decay", torch.ones(count, dtype=torch.float64))
+        self.margin: Tensor  # (k,)
+        self.decay: Tensor  # (k,) 1/s
+        if decay is not None:
+            rates = one_or_each("SafetyFilter", "decay", decay, count)
+            self.decay.copy_(positive("SafetyFilter", "decay", rates))
+        x, t = self._around()
+        self._check_shapes(x)
+        values = self.margins(x, t).unflatten(0, (len(TIMES), _PROBES))
+        self.moving = bool((values != values[:1]).any())
+        self.degree = self._degrees(degree, x, t)
+        found = _brakes(self, x, t)
+        self.brakes: tuple[float | None, ...] = found.constant
+        self.usual: tuple[float | None, ...] = found.usual
+        self.weak: tuple[bool, ...] = found.weak
+        self.apart: bool = found.apart
+        if decay is None:
+            self.decay.copy_(torch.tensor(found.decay, dtype=torch.float64))
+        second = torch.tensor(self.degree, dtype=torch.int64) == 2
+        if bool((second & (self.decay * self.hold > 1)).any()):
+            rule = f"must be at most 1/dt = {1 / self.hold:g} where the relative degree is two"
+            raise fail("SafetyFilter", "decay", rule, decay)
+
+    def margins(self, x: Tensor, t: float | Tensor = 0.0) -> Tensor:
+        """h of every constraint: (..., n) and a number or (...) -> (..., k)."""
+        time = torch.as_tensor(t).to(x).expand(x.shape[:-1]).reshape(-1)
+        rows = x.reshape(-1, x.shape[-1])
+        columns = [torch.func.vmap(h)(rows.unsqueeze(1), time) for h in map(number, self.constraints)]
+        return torch.stack(columns, dim=-1).reshape(*x.shape[:-1], -1)
+
+    def every(self, of: Callable[..., tuple[Tensor, ...]], *rows: Tensor) -> list[Tensor]:
+        """Evaluate a function of (k, x, ..., t), one row, for every constraint: (B, k, ...) each."""
+        *states, t = rows
+        given = [each.unsqueeze(1) for each in states]
+        each = [functools.partial(of, k) for k in range(len(self.constraints))]
+        parts = [torch.func.vmap(one)(*given, t) for one in each]
+        return [torch.stack(column, dim=1) for column in zip(*parts, strict=True)]
+
+    def shortfall(self, k: int, x: Tensor, u: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return how far the conditions are missed with u held, h now, and by how much the speed at the end
+        is one to be looked into, positive if so: (1, n), (1, m), () -> (), (), ()."""
+        ends, end, middle = self._held(k, x, u, t)
+        missing = self._required(k, ends, end, middle) - end
+        if self.degree[k] == 2:
+            missing = torch.maximum(missing, -self._stop(k, ends))
+        strain, usual = torch.zeros_like(missing) - 1, self.usual[k]
+        if self.brakes[k] is None and usual is not None and self.degree[k] == 2:
+            room = (2 * _CAREFUL * usual * ends.last_value).square() * ends.last_slope
+            near = (ends.last_rate < 0) & (ends.last_value > 0)
+            strain = torch.where(near, ends.last_rate.square().square() - room, strain)
+        return missing, number(self.constraints[k])(x, t), strain
+
+    def inequality(self, k: int, x: Tensor, u: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Linearise one constraint for one row: (1, n), (1, m), () -> (1, m), (), ()."""
+
+        def held(u: Tensor) -> tuple[Tensor, tuple[Tensor, Ends, Tensor]]:
+            ends, end, middle = self._held(k, x, u, t)
+            return end, (end, ends, middle)
+
+        slope, (end, ends, middle) = torch.func.grad(held, has_aux=True)(u)
+        miss = self._required(k, ends, end, middle) - end
+        if self.degree[k] == 2:
+
+            def stop(u: Tensor) -> tuple[Tensor, Tensor]:
+                gap = self._stop(k, self._held(k, x, u, t)[0])
+                return gap, gap
+
+            other, gap = torch.func.grad(stop, has_aux=True)(u)
+            first, second = slope.square().sum().sqrt(), other.square().sum().sqrt()
+            harder = (-gap * first > miss * second) & (gap < 0)
+            slope, miss = torch.where(harder, other, slope), torch.where(harder, -gap, miss)
+        least = (miss + (slope * u).sum()) / self.hold
+        return slope / self.hold, least, number(self.constraints[k])(x, t)
+
+    def over(self, k: int, x: Tensor, u: Tensor, t: Tensor) -> Ends:
+        """Return one constraint over the hold: (1, n), (1, m), () -> () each."""
+        return self._held(k, x, u, t)[0]
+
+    def lean(self, k: int, x: Tensor, t: Tensor) -> Lean:
+        """Return what moves one constraint of one row: (1, n), () -> () each, the slope (m,)."""
+        value, rate, _ = self.level(k, x, t)
+
+        def push(u: Tensor) -> tuple[Tensor, Tensor]:
+            found = rate_along(self._last(k), self.plant, x, u, t)
+            return found, found
+
+        rest = self.plant.resting_input().to(x).unsqueeze(0)
+        slope, drift = torch.func.grad(push, has_aux=True)(rest)
+        low, high = self.bounds.low.to(x), self.bounds.high.to(x)
+        farther = torch.where(slope > 0, slope * (high - rest), slope * (low - rest))
+        ability = drift + torch.where(slope == 0, 0.0, farther).sum()
+        return Lean(value, rate, drift, slope[0], ability)
+
+    def advance(self, x: Tensor, u: Tensor, length: float | Tensor) -> Tensor:
+        """x after that time, s, by one Runge-Kutta step."""
+        plant = self.plant
+        return runge_kutta_step(lambda at: plant.velocity(at, u), x, length, plant.displaced)
+
+    def level(self, k: int, x: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return h - margin, h' at the resting input (0 where the degree is one) and the square of the
+        gradient of h, of one row."""
+        h, rest = number(self.constraints[k]), self.plant.resting_input()
+        value = h(x, t) - self.margin[k].to(x)
+        if self.degree[k] == 1:
+            return value, torch.zeros_like(value), torch.ones_like(value)
+        along_x, along_t = torch.func.grad(h, argnums=(0, 1))(x, t)
+        rate = (along_x * self.plant.motion(x, rest.to(x).unsqueeze(0))).sum() + along_t
+        return value, rate, along_x.square().sum()
+
+    def _last(self, k: int) -> RowValue:
+        """Return the last derivative of h, along the plant, that no input moves."""
+        h, rest = number(self.constraints[k]), self.plant.resting_input()
+        if self.degree[k] == 1:
+            return h
+        return lambda x, t: rate_along(h, self.plant, x, rest.to(x).unsqueeze(0), t)
+
+    def _phi(self, k: int, value: Tensor, rate: Tensor) -> Tensor:
+        return value if self.degree[k] == 1 else rate + self.decay[k].to(rate) * value
+
+    def _held(self, k: int, x: Tensor, u: Tensor, t: Tensor) -> tuple[Ends, Tensor, Tensor]:
+        """The constraint over the hold, and phi at its end and in its middle."""
+        middle = self.advance(x, u, 0.5 * self.hold)
+        end = self.advance(middle, u, 0.5 * self.hold)
+        value, rate, _ = self.level(k, x, t)
+        between, middle_rate, _ = self.level(k, middle, t + 0.5 * self.hold)
+        last = self.level(k, end, t + self.hold)
+        phi, halfway = self._phi(k, *last[:2]), self._phi(k, between, middle_rate)
+        return Ends(value, rate, between, *last), phi, halfway
+
+    def _required(self, k: int, ends: Ends, end: Tensor, middle: Tensor) -> Tensor:
+        """Return the least phi at the end by the barrier's condition."""
+        decay, now = self.decay[k].to(end), self._phi(k, ends.value, ends.rate)
+        dip = 0.5 * (now + end) - middle
+        dip = torch.where(dip > 0, dip, 0.0)
+        return dip + torch.exp(-decay * self.hold) * (now - dip)
+
+    def _stop(self, k: int, ends: Ends) -> Tensor:
+        """Return by how much the stop's condition is kept, as a rate of h.
+
+        Where phi < 0: h' at the end is what the deceleration leaves that stops at the edge. Else, where the
+        brakes are one number: the speed at the end can be stopped.
+        """
+        value, rate, _, last_value, last_rate, _ = ends
+        speed = _speed(rate)
+        least = _RESERVE * speed * self.hold
+        room = (1 - _RESERVE) * torch.where(value > least, value, least)
+        asked = 0.5 * self.hold * speed.square() / torch.where(speed > 0, room, 1.0) - speed
+        asked = torch.where(value > 0, asked, 0.0)
+        fast = (rate < 0) & (rate + self.decay[k].to(rate) * value < 0)
+        free, brakes = torch.ones_like(rate), self.brakes[k]
+        if brakes is not None:
+            most = (1 - _RESERVE) * brakes
+            left = 2 * most * last_value - _speed(last_rate).square()
+            free = torch.where(value > 0, left / (most * self.hold + rate.abs()), free)
+        return torch.where(fast, last_rate - asked, free)
+
+    def _around(self) -> tuple[Tensor, Tensor]:
+        """Return states around the equilibrium, and times."""
+        generator = torch.Generator().manual_seed(0)
+        around = torch.randn(_PROBES, self.plant.dim or 0, dtype=torch.float64, generator=generator)
+        x = (self.plant.equilibrium() + around).repeat(len(TIMES), 1)
+        return x, torch.tensor(TIMES, dtype=torch.float64).repeat_interleave(_PROBES)
+
+    def _check_shapes(self, x: Tensor) -> None:
+        for k, h in enumerate(self.constraints):
+            shape = tuple(h(x[:3], torch.zeros((), dtype=x.dtype)).shape)
+            if shape != (3,):
+                raise fail("SafetyFilter", "constraints", f"must map (3, n) to (3,), number {k}", shape)
+
+    def _degrees(self, degree: int | Sequence[int] | None, x: Tensor, t: Tensor) -> tuple[int, ...]:
+        if degree is not None:
+            given = [degree] * len(self.constraints) if isinstance(degree, int) else list(degree)
+            if len(given) != len(self.constraints) or not set(given) <= {1, 2}:
+                raise fail("SafetyFilter", "degree", "must be 1 or 2, one a constraint", degree)
+            return tuple(given)
+        found = [self._degree(number(h), x.unsqueeze(1), t) for h in self.constraints]
+        if 0 in found:
+            raise ValueError(
+                f"`SafetyFilter(constraints=...)`: the control moves neither first nor second derivative "
+                f"of number {found.index(0)}, at {len(x)} states around the equilibrium. A relative degree "
+                "of three and more needs another h; one that is flat there needs its `degree`."
+            )
+        return tuple(found)
+
+    def _degree(self, h: RowValue, x: Tensor, t: Tensor) -> int:
+        """1 or 2: which derivative of h the control moves at states (P, 1, n); 0 for neither."""
+        rest = self.plant.resting_input().double().unsqueeze(0)
+
+        def first(x: Tensor, t: Tensor) -> Tensor:
+            return rate_along(h, self.plant, x, rest, t)
+
+        for which, phi in ((1, h), (2, first)):
+
+            def rate(u: Tensor, x: Tensor, t: Tensor, phi: RowValue = phi) -> Tensor:
+                return rate_along(phi, self.plant, x, u, t)
+
+            effect = torch.func.vmap(torch.func.grad(rate), in_dims=(None, 0, 0))(rest, x, t)
+            if bool((effect.abs() > _NOTHING).any()):
+                return which
+        return 0
+
+
+class _Brakes(NamedTuple):
+    """What the inputs can do for every constraint, found at states around the equilibrium."""
+
+    constant: tuple[float | None, ...]  # the largest h'' where it is the same everywhere, positive and finite
+    usual: tuple[float | None, ...]  # what the inputs can add a unit of the gradient; None without bounds
+    weak: tuple[bool, ...]  # whether there are edges, h = h' = 0, at which they cannot hold it
+    apart: bool  # whether all are constant, and braking for one never drives another
+    decay: tuple[float, ...]  # by default
+
+
+def _brakes(of: Conditions, x: Tensor, t: Tensor) -> _Brakes:
+    lean, slopes = Lean(*of.every(of.lean, x, t)), of.every(of.level, x, t)[2].sqrt()
+    count, fastest = len(of.constraints), 1 / (_PERIODS * of.hold)
+    constant: list[float | None] = []
+    usual: list[float | None] = []
+    weak, decays = [], []
+    for k in range(count):
+        value, reach = lean.value[:, k], (lean.ability - lean.drift)[:, k]
+        inside = (value > 0) & (reach > _NOTHING)
+        limited = bool(inside.any()) and bool(torch.isfinite(reach).all())
+        usual.append(float((reach / slopes[:, k])[inside].quantile(_RARE)) if limited else None)
+        same = limited and of.degree[k] == 2 and _same(lean.ability[:, k]) and _same(lean.slope[:, k])
+        good = same and float(lean.ability[0, k]) > _NOTHING
+        constant.append(float(lean.ability[0, k]) if good else None)
+        weak.append(limited and not good and _is_weak(of, k, x, t, float(reach[inside].median())))
+        decays.append(min(_decay(of.degree[k], value, reach, inside) if limited else fastest, fastest))
+    alone = all(a is not None or of.degree[k] == 1 or usual[k] is None for k, a in enumerate(constant))
+    apart = alone and not any(weak) and all(
+        _apart(lean, i, j) for i in range(count) for j in range(i) if of.degree[i] == of.degree[j] == 2
+    )
+    return _Brakes(tuple(constant), tuple(usual), tuple(weak), apart, tuple(decays))
+
+
+def _decay(degree: int, value: Tensor, reach: Tensor, inside: Tensor) -> float:
+    """Return how fast h may fall so that from a usual distance the fastest admitted rate can just be stopped:
+    reach / h (degree one) or sqrt(2 reach / h), of the time of which it is largest."""
+    share = torch.where(inside, reach / value, torch.nan).reshape(len(TIMES), -1)
+    fastest = float(torch.nanmedian(share, dim=1).values.nan_to_num(0.0).max())
+    return fastest if degree == 1 else (2 * fastest) ** 0.5
+
+
+def _same(values: Tensor) -> bool:
+    spread = (values - values[:1]).abs().max()
+    return bool(spread <= _NOTHING * (1 + values.abs().max()))
+
+
+def _apart(lean: Lean, i: int, j: int) -> bool:
+    """Return whether two constraints want no input the opposite way, or are two sides of one corridor."""
+    opposed = bool((lean.slope[:, i] * lean.slope[:, j] < 0).any())
+    return not opposed or _same(lean.value[:, i] + lean.value[:, j])
+
+
+def _is_weak(of: Conditions, k: int, x: Tensor, t: Tensor, usual: float) -> bool:
+    """Return whether the bounds cannot hold h at several states of its edge, where h (and h') are 0."""
+
+    def off(x: Tensor, t: Tensor) -> Tensor:
+        return torch.stack(of.level(k, x.unsqueeze(0), t)[: of.degree[k]])
+
+    edge = x
+    for _ in range(6):  # Newton's steps of least length
+        value = torch.func.vmap(off)(edge, t)
+        slope = torch.func.vmap(torch.func.jacrev(off))(edge, t)
+        step = (torch.linalg.pinv(torch.nan_to_num(slope)) @ value.unsqueeze(-1)).squeeze(-1)
+        edge = edge - step
+    near = (torch.func.vmap(off)(edge, t).abs() < 1e-6).all(-1) & torch.isfinite(edge).all(-1)
+    if not bool(near.any()):
+        return False
+    (*_, ability) = torch.func.vmap(functools.partial(of.lean, k))(edge[near].unsqueeze(1), t[near])
+    return float((ability < 1e-3 * usual * (of.degree[k] == 2)).double().mean()) > _SEVERAL
+
+
+def _speed(rate: Tensor) -> Tensor:
+    """Return how fast h falls, at least 0."""
+    return torch.where(rate < 0, -rate, 0.0)
+
+
+def listed(call: str, constraints: Constraint | Sequence[Constraint]) -> list[Constraint]:
+    """The constraints as a list, refused in the name of ``call`` where they are no functions."""
+    several = [constraints] if callable(constraints) else list(constraints)
+    if not several or not all(map(callable, several)):
+        raise fail(call, "constraints", "must be h(x, t) or a list of them", constraints)
+    return several
+
+
+def check_traceable(call: str, plant: Plant) -> None:
+    """Refuse a plant in discrete time, or with what torch cannot see into."""
+    if isinstance(plant, StepPlant) or not isinstance(plant, Plant) or not plant.traceable:
+        raise fail(call, "plant", "must be in continuous time and torch all through", plant)
+
+
+def number(h: Constraint) -> RowValue:
+    """h of one row: (1, n), () -> ()."""
+    return lambda x, t: h(x, t)[0]
+
+
+def rate_along(phi: RowValue, plant: Plant, x: Tensor, u: Tensor, t: Tensor) -> Tensor:
+    """d phi / dt along the plant: (1, n), (1, m), () -> ()."""
+    along_x, along_t = torch.func.grad(phi, argnums=(0, 1))(x, t)
+    rate: Tensor = (along_x * plant.motion(x, u)).sum() + along_t
+    return rate

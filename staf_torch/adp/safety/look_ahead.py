@@ -1,0 +1,281 @@
+"""What becomes of a state after a hold: can the brakes stop it inside, or the policy bring it back inside?
+
+A condition of one hold says nothing of the next ones where bounds limit the inputs. Here the hardest brake is
+followed until nothing comes nearer to its edge; of double integrators that is v^2 <= 2 a h. Where braking
+along an edge would drive the rest of the plant away (a coordinate that must first move the wrong way) the
+brakes keep nothing, and the policy itself is followed.
+
+Source: Gurriet, Mote, Singletary, Nilsson, Feron, Ames, "A scalable safety critical control framework for
+nonlinear systems", IEEE Access (2020): a set that a backup law keeps.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from ...lanes import repeat, where_rows
+from ..loop.controller import Policy
+from .conditions import Conditions, Ends, Lean
+
+_BRAKING, _SHARE = 48, 8.0  # steps of the hardest brake; each at least a period and 1/8 of what is left
+_FOLLOWED, _CONSTANTS = 300, 4.0  # periods of the policy at most; time constants of its slowest mode
+_URGENT = 0.5  # share of the brakes at a state, from which on they are followed
+_BACK = 0.5  # of x'Px, to which the policy must have brought the state
+_ROUNDED = 1e-9  # of h, by which an edge may be missed
+_UNSTABLE = 0.01  # of the fastest mode, from which on one that grows counts
+_NEVER = 1e6  # s, for which what no brake slows goes on
+
+
+class Opposed(NamedTuple):
+    """What braking along an edge does to the rest of the plant, linearised at the equilibrium."""
+
+    rate: Tensor  # (k,) 1/s, of the fastest growth; at most 0 where nothing runs away
+    alone: float | None  # 1/s, of the slowest mode under the policy alone; None where it is not known
+    bowl: Tensor | None  # P of x'Px, which falls under the policy
+
+
+class Chosen(NamedTuple):
+    """The control that keeps what can be kept."""
+
+    control: Tensor  # (B, m)
+    left: Tensor  # (B,) by how much h - margin stays above min(0, what it is now): negative where it cannot
+
+
+class LookAhead(nn.Module):
+    """Choose between controls by what follows them.
+
+    Args:
+        conditions: of the filter.
+        policy: u from x; None for one that remembers, which is not followed.
+    """
+
+    def __init__(self, conditions: Conditions, policy: Policy | None) -> None:
+        super().__init__()
+        self.conditions = conditions
+        found = opposition(conditions, policy)
+        self.against = found.rate
+        self.opposed = bool((found.rate > 0).any())
+        self.weak = any(conditions.weak)
+        bounded = any(usual is not None for usual in conditions.usual)
+        self.acts = bounded or self.opposed
+        self.by_policy = policy is not None and (self.weak or (self.opposed and found.alone is not None))
+        self.by_brakes = not (self.opposed and self.by_policy)
+        if self.opposed and not self.by_policy:
+            self.acts = False  # nothing tells what becomes of a state
+        slow = max(-(found.alone or 0.0), 1e-9)
+        periods = min(_CONSTANTS / slow / conditions.hold, float(_FOLLOWED))
+        self.periods = max(math.ceil(periods), 20)
+        self.longest = max(conditions.hold, 0.5 / max(_fastest(conditions), 1e-9))
+        self.register_buffer("bowl", found.bowl if self.opposed and self.by_policy else None)
+        self.bowl: Tensor | None
+
+    def asked(self, x: Tensor, u: Tensor, t: Tensor, strain: Tensor) -> Tensor:
+        """The rows whose brakes may not do: (B, n), (B, m), (B,), (B,) -> (B,) bool."""
+        of = self.conditions
+        second = torch.tensor(of.degree, device=x.device) == 2
+
+        def urgent(given: tuple[Tensor, ...]) -> Tensor:
+            x, u, t = given
+            end = of.advance(of.advance(x, u, 0.5 * of.hold), u, 0.5 * of.hold)
+            lean = Lean(*of.every(of.lean, end, t + of.hold))
+            need = _speed(lean).square() > 2 * _URGENT * lean.ability * lean.value
+            return (second & (lean.rate < 0) & (lean.value > 0) & need).any(-1).to(x)
+
+        return where_rows(strain > 0, urgent, (x, u, t), torch.zeros_like(t)) > 0
+
+    def choose(self, policy: Policy | None, given: tuple[Tensor, ...], where: Tensor) -> Chosen:
+        """The first control whose consequences are fine, else the one of the best: wanted (B, m), found by the
+        conditions (B, m), x (B, n) and t (B,), in the rows asked for."""
+        wanted, found, x, t = given
+        none = torch.zeros_like(t)
+        start = wanted, found, x, t, found, none - math.inf, none, where
+
+        def further(now: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+            wanted, found, x, t, best, left, count, _ = now
+            hardest = self.hardest(Lean(*self.conditions.every(self.conditions.lean, x, t)))
+            first, second = found, 0.5 * (found + hardest)
+            if self.opposed:
+                first, second = wanted, found
+            elif self.weak:
+                second = wanted
+            tried = torch.where(count.unsqueeze(-1) == 1, second, hardest)
+            tried = torch.where(count.unsqueeze(-1) == 0, first, tried)
+            now_left = self.left_after(policy, x, tried, t)
+            better = now_left > left
+            best = torch.where(better.unsqueeze(-1), tried, best)
+            left, count = torch.where(better, now_left, left), count + 1
+            return wanted, found, x, t, best, left, count, (left < -_ROUNDED) & (count < 3)
+
+        _, _, _, _, control, left, _, _ = repeat(3, further, start, where=lambda now: now[7])
+        return Chosen(control, torch.where(left < -_ROUNDED, left, 0.0))
+
+    def hardest(self, lean: Lean) -> Tensor:
+        """The control that brakes as hard as can be, for what is most urgent: (B, m)."""
+        of, like = self.conditions, lean.value
+        second = torch.tensor(of.degree, device=like.device) == 2
+        room = torch.where(lean.value > _ROUNDED, lean.value, _ROUNDED)
+        able = torch.where(lean.ability > _ROUNDED, lean.ability, _ROUNDED)
+        away = torch.where(lean.drift < 0, -lean.drift, 0.0)
+        urgency = torch.where(second, 0.5 * _speed(lean).square() / (room * able), of.hold * away / room)
+        most = urgency.amax(-1, keepdim=True)
+        weight = (urgency / torch.where(most > 0, most, 1.0)) ** 4
+        length = lean.slope.square().sum(-1).sqrt()
+        share = torch.where(length > 0, weight / torch.where(length > 0, length, 1.0), 0.0)
+        push = (share.unsqueeze(-1) * lean.slope).sum(-2)
+        rest = of.plant.resting_input().to(like)
+        low, high = of.bounds.low.to(like), of.bounds.high.to(like)
+        low, high = (torch.where(torch.isfinite(end), end, rest) for end in (low, high))
+        idle = torch.minimum(torch.maximum(rest, low), high)
+        return torch.where(push > 0, high, torch.where(push < 0, low, idle))
+
+    def left_after(self, policy: Policy | None, x: Tensor, u: Tensor, t: Tensor) -> Tensor:
+        """By how much every h - margin stays above min(0, its value now) in the hold and after it: (B,)."""
+        of = self.conditions
+        ends = Ends(*of.every(of.over, x, u, t))
+        end = of.advance(of.advance(x, u, 0.5 * of.hold), u, 0.5 * of.hold)
+        later, time = torch.full_like(t, -math.inf), t + of.hold
+        least = torch.where(ends.value < 0, ends.value, 0.0)
+        if self.by_brakes and of.apart:
+            later = (self._stopped(ends) - least).amin(-1)
+        elif self.by_brakes:
+            later = (self._braked(end, time) - least).amin(-1)
+        if self.by_policy and policy is not None:
+            later = torch.maximum(later, (self._followed(policy, end, time) - least).amin(-1))
+        return torch.minimum((ends.least(of.hold) - least).amin(-1), later)
+
+    def _stopped(self, ends: Ends) -> Tensor:
+        """h - margin where constant brakes have stopped: (B, k)."""
+        brakes = [math.inf if a is None else a for a in self.conditions.brakes]
+        most = torch.tensor(brakes).to(ends.value)
+        speed = torch.where(ends.last_rate < 0, -ends.last_rate, 0.0)
+        return ends.last_value - 0.5 * speed.square() / most
+
+    def _braked(self, x: Tensor, t: Tensor) -> Tensor:
+        """The smallest h - margin under the hardest brake until nothing comes nearer: (B, k)."""
+        of = self.conditions
+        second = torch.tensor(of.degree, device=x.device) == 2
+        weak = torch.tensor(of.weak, device=x.device)
+        value, rate, _ = of.every(of.level, x, t)
+        start = x, t, value, rate, value, value, t == t
+
+        def brake(now: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+            x, t, value, rate, _, least, _ = now
+            lean = Lean(*of.every(of.lean, x, t))
+            able = torch.where(lean.ability > 0, lean.ability, 1.0)
+            left = torch.where(second & (lean.ability > 0), _speed(lean) / able, 0.0).amax(-1) / _SHARE
+            length = torch.where(left > of.hold, torch.where(left < self.longest, left, self.longest), of.hold)
+            x, t, ends = self._moved(x, self.hardest(lean), t, value, rate, length)
+            going = (ends.last_rate < 0) | ((weak | ~second) & (lean.ability < 0))
+            least = torch.minimum(least, ends.least(length.unsqueeze(-1)))
+            return x, t, ends.last_value, ends.last_rate, lean.ability, least, going.any(-1)
+
+        done = repeat(_BRAKING, brake, start, where=lambda now: now[6])
+        _, _, value, rate, ability, least, going = done
+        speed = torch.where(rate < 0, -rate, 0.0)
+        able = torch.where(ability > 0, ability, 1.0)
+        far = torch.where(ability > 0, 0.5 * speed.square() / able, _NEVER * speed)
+        far = torch.where(second, far, torch.where(ability < 0, -_NEVER * ability, 0.0))
+        return torch.where(going.unsqueeze(-1), torch.minimum(least, value - far), least)
+
+    def _followed(self, policy: Policy, x: Tensor, t: Tensor) -> Tensor:
+        """The smallest h - margin under the policy, -inf where it does not come back: (B, k)."""
+        of = self.conditions
+        value, rate, _ = of.every(of.level, x, t)
+        length = torch.full_like(t, of.hold)
+
+        def follow(now: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+            x, t, value, rate, least = now
+            x, t, ends = self._moved(x, of.bounds.clip(policy(x)), t, value, rate, length)
+            return x, t, ends.last_value, ends.last_rate, torch.minimum(least, ends.least(of.hold))
+
+        last, _, _, _, least = repeat(self.periods, follow, (x, t, value, rate, value))
+        back = torch.isfinite(last).all(-1)
+        if self.bowl is not None:
+            back = back & (self._height(last) <= _BACK * self._height(x) + _ROUNDED)
+        least = torch.where(torch.isfinite(least), least, -_NEVER)
+        return torch.where(back.unsqueeze(-1), least, least - _NEVER)
+
+    def _height(self, x: Tensor) -> Tensor:
+        assert self.bowl is not None
+        off = x - self.conditions.plant.equilibrium().to(x)
+        return (off * (off @ self.bowl.to(x))).sum(-1)
+
+    def _moved(
+        self, x: Tensor, u: Tensor, t: Tensor, value: Tensor, rate: Tensor, length: Tensor
+    ) -> tuple[Tensor, Tensor, Ends]:
+        of, half = self.conditions, 0.5 * length
+        middle = of.advance(x, u, half.unsqueeze(-1))
+        between, *_ = of.every(of.level, middle, t + half)
+        x, t = of.advance(middle, u, half.unsqueeze(-1)), t + length
+        return x, t, Ends(value, rate, between, *of.every(of.level, x, t))
+
+
+def opposition(of: Conditions, policy: Policy | None) -> Opposed:
+    """Find what braking along every edge does to the rest of the plant: the modes of
+
+        x' = (A - B K) x - B s'/(s s') phi (A - B K + decay) x,
+
+    in which the barrier's condition holds with equality, phi the row of the constraint's last derivative
+    (plus decay times h) and s = its product with B. A mode that grows there, faster than under the policy
+    alone, is an unstable zero: the constraint's coordinate must first move the wrong way.
+    """
+    count, none = len(of.constraints), Opposed(torch.zeros(len(of.constraints)), None, None)
+    plant = of.plant
+    rest, at = plant.resting_input().double(), plant.equilibrium().double()
+    try:
+        a, b = torch.func.jacrev(plant.motion, argnums=(0, 1))(at, rest)
+        gain = torch.zeros_like(b.mT) if policy is None else -torch.func.jacrev(policy)(at).reshape(b.mT.shape)
+    except Exception:  # a policy that no derivative passes through is not linearised
+        a, b = torch.func.jacrev(plant.motion, argnums=(0, 1))(at, rest)
+        gain, policy = torch.zeros_like(b.mT), None
+    a, b, gain = a.detach(), b.detach(), gain.detach().to(a)
+    closed = a - b @ gain
+    if not bool(torch.isfinite(closed).all()):
+        return none
+    alone = float(torch.linalg.eigvals(closed).real.max()) if policy is not None else None
+    fast = float(torch.linalg.eigvals(closed).abs().max())
+    if alone is not None and alone > _UNSTABLE * fast:
+        return none  # the policy brings nothing back by itself
+    rates = torch.zeros(count)
+    x, _ = of._around()
+    normals = [torch.func.vmap(torch.func.grad(lambda x, h=h: h(x.unsqueeze(0), torch.zeros(()).to(x))[0]))
+               for h in of.constraints]  # fmt: skip
+    for k, normal in enumerate(normals):
+        grown = [_growth(c, a, b, closed, float(of.decay[k]), of.degree[k]) for c in normal(x[:8])]
+        known = sorted(rate for rate in grown if rate is not None)
+        if known and (middle := known[len(known) // 2]) > 0:
+            rates[k] = middle
+    bowl = None
+    if alone is not None and alone < 0 and bool((rates > 0).any()):
+        eye, turned = torch.eye(len(a), dtype=a.dtype), closed.mT.contiguous()  # A'P + PA = -1
+        bowl = torch.linalg.solve(torch.kron(eye, turned) + torch.kron(turned, eye), -eye.flatten())
+        bowl = bowl.unflatten(0, eye.shape)
+    return Opposed(rates, alone, bowl)
+
+
+def _growth(c: Tensor, a: Tensor, b: Tensor, closed: Tensor, decay: float, degree: int) -> float | None:
+    """Return the growth of the fastest mode along an edge of normal c, 0 for none; None without an effect."""
+    phi, push = (c, c @ b) if degree == 1 else (c @ a + decay * c, c @ a @ b)
+    size = float(push.square().sum())
+    if not size > 1e-12 * float((c.square().sum() * b.square().sum()).clamp(min=1e-300)):
+        return None
+    eye = torch.eye(len(a), dtype=a.dtype)
+    along = closed - torch.outer(b @ push, phi @ (closed + decay * eye)) / size
+    modes = torch.linalg.eigvals(along)
+    growth, before = float(modes.real.max()), float(torch.linalg.eigvals(closed).real.max())
+    return growth if growth > max(_UNSTABLE * float(modes.abs().max()), before) else 0.0
+
+
+def _fastest(of: Conditions) -> float:
+    """Return the fastest rate of the plant at its equilibrium, 1/s: below it lie steps of the brakes."""
+    at, rest = of.plant.equilibrium().double(), of.plant.resting_input().double()
+    a = torch.func.jacrev(of.plant.motion)(at, rest).detach()
+    return float(torch.linalg.matrix_norm(a)) if bool(torch.isfinite(a).all()) else math.inf
+
+
+def _speed(lean: Lean) -> Tensor:
+    return torch.where(lean.rate < 0, -lean.rate, 0.0)
