@@ -28,6 +28,7 @@ _NOTHING = 1e-9  # of the slopes that make it, below which the effect of a contr
 _RESERVE = 1e-3  # share of a distance, and of the brakes, that a stop leaves
 _PERIODS = 5.0  # in which h falls by 1/e at the fastest decay that is chosen without being asked for
 _CAREFUL, _RARE = 0.5, 0.1  # a stop is looked into from this share of that quantile of the brakes on
+_FAR = 100.0  # times the largest bound, to which brakes may use an input that has none
 _SEVERAL = 1 / 3  # of the edges tried, on which brakes that cannot hold h make a constraint a weak one
 
 
@@ -55,9 +56,7 @@ class Ends(NamedTuple):
         """The smallest value after the beginning, by the parabola where the rate changes its sign."""
         turns = (self.rate < 0) & (self.last_rate > 0)
         bend = torch.where(turns, self.last_rate - self.rate, 1.0)
-        summit = torch.where(
-            turns, self.value - 0.5 * hold * self.rate.square() / bend, self.last_value
-        )
+        summit = torch.where(turns, self.value - 0.5 * hold * self.rate.square() / bend, self.last_value)
         return torch.minimum(torch.minimum(summit, self.between), self.last_value)
 
 
@@ -92,6 +91,10 @@ class Conditions(nn.Module):
         if decay is not None:
             rates = one_or_each("SafetyFilter", "decay", decay, count)
             self.decay.copy_(positive("SafetyFilter", "decay", rates))
+        for name, end in (("low", bounds.low), ("high", bounds.high)):
+            self.register_buffer(name, _reachable(end, bounds, plant.resting_input()))
+        self.low: Tensor  # (m,) as far as brakes may reach
+        self.high: Tensor
         x, t = self._around()
         self._check_shapes(x)
         values = self.margins(x, t).unflatten(0, (len(TIMES), _PROBES))
@@ -174,7 +177,7 @@ class Conditions(nn.Module):
 
         rest = self.plant.resting_input().to(x).unsqueeze(0)
         slope, drift = torch.func.grad(push, has_aux=True)(rest)
-        low, high = self.bounds.low.to(x), self.bounds.high.to(x)
+        low, high = self.low.to(x), self.high.to(x)
         farther = torch.where(slope > 0, slope * (high - rest), slope * (low - rest))
         ability = drift + torch.where(slope == 0, 0.0, farther).sum()
         return Lean(value, rate, drift, slope[0], ability)
@@ -298,35 +301,52 @@ class _Brakes(NamedTuple):
     decay: tuple[float, ...]  # by default
 
 
+def _reachable(end: Tensor, bounds: Bounds, rest: Tensor) -> Tensor:
+    """Bounds in which inputs without one of their own may go far beside the others that have one."""
+    both = torch.cat((bounds.low - rest, bounds.high - rest)).double()
+    known = both[torch.isfinite(both)].abs()
+    if not len(known):
+        return end.clone()
+    far = _FAR * float(known.max())
+    return torch.where(torch.isfinite(end), end, rest.to(end) + torch.sign(end) * far)
+
+
 def _brakes(of: Conditions, x: Tensor, t: Tensor) -> _Brakes:
     lean, slopes = Lean(*of.every(of.lean, x, t)), of.every(of.level, x, t)[2].sqrt()
     count, fastest = len(of.constraints), 1 / (_PERIODS * of.hold)
+    rest, slope = of.plant.resting_input().to(x), lean.slope
+    own = torch.where(slope > 0, slope * (of.bounds.high - rest), slope * (of.bounds.low - rest))
+    sure = torch.where(torch.isfinite(own), own, 0.0).sum(-1)  # of the inputs that have bounds
     constant: list[float | None] = []
     usual: list[float | None] = []
     weak, decays = [], []
     for k in range(count):
-        value, reach = lean.value[:, k], (lean.ability - lean.drift)[:, k]
+        value, reach = lean.value[:, k], sure[:, k]
         inside = (value > 0) & (reach > _NOTHING)
-        limited = bool(inside.any()) and bool(torch.isfinite(reach).all())
+        limited = bool(inside.any()) and bool(torch.isfinite(lean.ability[:, k]).all())
         usual.append(float((reach / slopes[:, k])[inside].quantile(_RARE)) if limited else None)
         same = limited and of.degree[k] == 2 and _same(lean.ability[:, k]) and _same(lean.slope[:, k])
         good = same and float(lean.ability[0, k]) > _NOTHING
         constant.append(float(lean.ability[0, k]) if good else None)
         weak.append(limited and not good and _is_weak(of, k, x, t, float(reach[inside].median())))
-        decays.append(min(_decay(of.degree[k], value, reach, inside) if limited else fastest, fastest))
+        slowest = _decay(value, reach, inside) if limited and of.degree[k] == 2 else fastest
+        decays.append(min(slowest, fastest))
     alone = all(a is not None or of.degree[k] == 1 or usual[k] is None for k, a in enumerate(constant))
-    apart = alone and not any(weak) and all(
-        _apart(lean, i, j) for i in range(count) for j in range(i) if of.degree[i] == of.degree[j] == 2
+    apart = (
+        alone
+        and not any(weak)
+        and all(
+            _apart(lean, i, j) for i in range(count) for j in range(i) if of.degree[i] == of.degree[j] == 2
+        )
     )
     return _Brakes(tuple(constant), tuple(usual), tuple(weak), apart, tuple(decays))
 
 
-def _decay(degree: int, value: Tensor, reach: Tensor, inside: Tensor) -> float:
-    """Return how fast h may fall so that from a usual distance the fastest admitted rate can just be stopped:
-    reach / h (degree one) or sqrt(2 reach / h), of the time of which it is largest."""
+def _decay(value: Tensor, reach: Tensor, inside: Tensor) -> float:
+    """Return the decay at which the brakes just stop what is admitted at a usual distance, sqrt(2 reach / h),
+    at the time at which it is fastest. A rate that the inputs move themselves is stopped at once."""
     share = torch.where(inside, reach / value, torch.nan).reshape(len(TIMES), -1)
-    fastest = float(torch.nanmedian(share, dim=1).values.nan_to_num(0.0).max())
-    return fastest if degree == 1 else (2 * fastest) ** 0.5
+    return float((2 * torch.nanmedian(share, dim=1).values.nan_to_num(0.0).max()).sqrt())
 
 
 def _same(values: Tensor) -> bool:

@@ -23,6 +23,7 @@ from .conditions import Conditions, Ends, Lean
 
 _BRAKING, _SHARE = 48, 8.0  # steps of the hardest brake; each at least a period and 1/8 of what is left
 _FOLLOWED, _CONSTANTS = 300, 4.0  # periods of the policy at most; time constants of its slowest mode
+_SPARE = 0.01  # of the brakes, that a control must leave which is not the hardest
 _URGENT = 0.5  # share of the brakes at a state, from which on they are followed
 _BACK = 0.5  # of x'Px, to which the policy must have brought the state
 _ROUNDED = 1e-9  # of h, by which an edge may be missed
@@ -97,20 +98,23 @@ class LookAhead(nn.Module):
         def further(now: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
             wanted, found, x, t, best, left, count, _ = now
             hardest = self.hardest(Lean(*self.conditions.every(self.conditions.lean, x, t)))
-            first, second = found, 0.5 * (found + hardest)
+            first, second = found, found + 0.25 * (hardest - found)
             if self.opposed:
                 first, second = wanted, found
             elif self.weak:
                 second = wanted
-            tried = torch.where(count.unsqueeze(-1) == 1, second, hardest)
-            tried = torch.where(count.unsqueeze(-1) == 0, first, tried)
-            now_left = self.left_after(policy, x, tried, t)
+            turn = count.unsqueeze(-1)
+            tried = torch.where(turn == 2, 0.5 * (found + hardest), hardest)
+            tried = torch.where(turn == 0, first, torch.where(turn == 1, second, tried))
+            # What is not the hardest brake leaves a little of it for the next holds.
+            strength = torch.where(turn < 3, 1 - _SPARE, torch.ones_like(turn))
+            now_left = self.left_after(policy, x, tried, t, strength)
             better = now_left > left
             best = torch.where(better.unsqueeze(-1), tried, best)
             left, count = torch.where(better, now_left, left), count + 1
-            return wanted, found, x, t, best, left, count, (left < -_ROUNDED) & (count < 3)
+            return wanted, found, x, t, best, left, count, (left < -_ROUNDED) & (count < 4)
 
-        _, _, _, _, control, left, _, _ = repeat(3, further, start, where=lambda now: now[7])
+        _, _, _, _, control, left, _, _ = repeat(4, further, start, where=lambda now: now[7])
         return Chosen(control, torch.where(left < -_ROUNDED, left, 0.0))
 
     def hardest(self, lean: Lean) -> Tensor:
@@ -127,13 +131,13 @@ class LookAhead(nn.Module):
         share = torch.where(length > 0, weight / torch.where(length > 0, length, 1.0), 0.0)
         push = (share.unsqueeze(-1) * lean.slope).sum(-2)
         rest = of.plant.resting_input().to(like)
-        low, high = of.bounds.low.to(like), of.bounds.high.to(like)
-        low, high = (torch.where(torch.isfinite(end), end, rest) for end in (low, high))
+        low, high = of.low.to(like), of.high.to(like)
         idle = torch.minimum(torch.maximum(rest, low), high)
         return torch.where(push > 0, high, torch.where(push < 0, low, idle))
 
-    def left_after(self, policy: Policy | None, x: Tensor, u: Tensor, t: Tensor) -> Tensor:
-        """By how much every h - margin stays above min(0, its value now) in the hold and after it: (B,)."""
+    def left_after(self, policy: Policy | None, x: Tensor, u: Tensor, t: Tensor, strength: Tensor) -> Tensor:
+        """By how much every h - margin stays above min(0, its value now) in the hold and after it, under such
+        a share of the brakes, (B, 1): (B,)."""
         of = self.conditions
         ends = Ends(*of.every(of.over, x, u, t))
         end = of.advance(of.advance(x, u, 0.5 * of.hold), u, 0.5 * of.hold)
@@ -142,7 +146,7 @@ class LookAhead(nn.Module):
         if self.by_brakes and of.apart:
             later = (self._stopped(ends) - least).amin(-1)
         elif self.by_brakes:
-            later = (self._braked(end, time) - least).amin(-1)
+            later = (self._braked(end, time, strength) - least).amin(-1)
         if self.by_policy and policy is not None:
             later = torch.maximum(later, (self._followed(policy, end, time) - least).amin(-1))
         return torch.minimum((ends.least(of.hold) - least).amin(-1), later)
@@ -154,27 +158,31 @@ class LookAhead(nn.Module):
         speed = torch.where(ends.last_rate < 0, -ends.last_rate, 0.0)
         return ends.last_value - 0.5 * speed.square() / most
 
-    def _braked(self, x: Tensor, t: Tensor) -> Tensor:
+    def _braked(self, x: Tensor, t: Tensor, strength: Tensor) -> Tensor:
         """The smallest h - margin under the hardest brake until nothing comes nearer: (B, k)."""
         of = self.conditions
         second = torch.tensor(of.degree, device=x.device) == 2
         weak = torch.tensor(of.weak, device=x.device)
         value, rate, _ = of.every(of.level, x, t)
-        start = x, t, value, rate, value, value, t == t
+        start = x, t, value, rate, value, value, strength, t == t
+        rest = of.plant.resting_input().to(x)
 
         def brake(now: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-            x, t, value, rate, _, least, _ = now
+            x, t, value, rate, _, least, strength, _ = now
             lean = Lean(*of.every(of.lean, x, t))
             able = torch.where(lean.ability > 0, lean.ability, 1.0)
             left = torch.where(second & (lean.ability > 0), _speed(lean) / able, 0.0).amax(-1) / _SHARE
-            length = torch.where(left > of.hold, torch.where(left < self.longest, left, self.longest), of.hold)
-            x, t, ends = self._moved(x, self.hardest(lean), t, value, rate, length)
+            length = torch.where(
+                left > of.hold, torch.where(left < self.longest, left, self.longest), of.hold
+            )
+            u = rest + strength * (self.hardest(lean) - rest)
+            x, t, ends = self._moved(x, u, t, value, rate, length)
             going = (ends.last_rate < 0) | ((weak | ~second) & (lean.ability < 0))
             least = torch.minimum(least, ends.least(length.unsqueeze(-1)))
-            return x, t, ends.last_value, ends.last_rate, lean.ability, least, going.any(-1)
+            return x, t, ends.last_value, ends.last_rate, lean.ability, least, strength, going.any(-1)
 
-        done = repeat(_BRAKING, brake, start, where=lambda now: now[6])
-        _, _, value, rate, ability, least, going = done
+        done = repeat(_BRAKING, brake, start, where=lambda now: now[7])
+        _, _, value, rate, ability, least, _, going = done
         speed = torch.where(rate < 0, -rate, 0.0)
         able = torch.where(ability > 0, ability, 1.0)
         far = torch.where(ability > 0, 0.5 * speed.square() / able, _NEVER * speed)
@@ -228,7 +236,9 @@ def opposition(of: Conditions, policy: Policy | None) -> Opposed:
     rest, at = plant.resting_input().double(), plant.equilibrium().double()
     try:
         a, b = torch.func.jacrev(plant.motion, argnums=(0, 1))(at, rest)
-        gain = torch.zeros_like(b.mT) if policy is None else -torch.func.jacrev(policy)(at).reshape(b.mT.shape)
+        gain = (
+            torch.zeros_like(b.mT) if policy is None else -torch.func.jacrev(policy)(at).reshape(b.mT.shape)
+        )
     except Exception:  # a policy that no derivative passes through is not linearised
         a, b = torch.func.jacrev(plant.motion, argnums=(0, 1))(at, rest)
         gain, policy = torch.zeros_like(b.mT), None

@@ -29,8 +29,11 @@ _OPPOSED = (
     "equilibrium (a coordinate that must first move the wrong way): %s. Plan instead: `AvoidanceCost` with "
     "`RecedingHorizon`, see adp/safety/README.md."
 )
-_FOLLOWS = "the policy is left alone wherever it stays inside by itself, and what it cannot keep is `infeasible`"
+_FOLLOWS = (
+    "the policy is left alone wherever it stays inside by itself, and what it cannot keep is `infeasible`"
+)
 _TOPPLES = "the filter acts nevertheless, as nothing tells what a policy that remembers would do"
+_FOLLOWING = 1000.0  # steps of a feedback law that a control takes where the policy is followed ahead
 _SLACK = 1e-9  # in units of the input, from which on the brakes are asked whether they do
 
 
@@ -140,6 +143,7 @@ class SafetyFilter(Controller):
         self.register_buffer("table", cases(count, low_.tolist(), high_.tolist()))
         self.table: Tensor
         self.ahead = LookAhead(self.conditions, self._policy)
+        self.work = _FOLLOWING if self.ahead.by_policy else self.work
         for k, rate in enumerate(self.ahead.against.tolist()):
             if rate > 0:
                 _log.warning(_OPPOSED, k, rate, _FOLLOWS if self.ahead.by_policy else _TOPPLES)
@@ -188,6 +192,8 @@ class SafetyFilter(Controller):
         if t is None and self.moving:
             raise fail("SafetyFilter", "t", "must be given: a constraint depends on the time", t)
         time = torch.as_tensor(0.0 if t is None else t).to(x).expand(x.shape[:-1])
+        if self.ahead.by_policy:
+            self._nearest.hasten()  # hundreds of periods are followed: seconds in plain torch
         found, k = self._nearest(torch.cat((x, u, time.unsqueeze(-1)), dim=-1)), len(self.constraints)
         control, margin, more = found.split((m := u.shape[-1], k, found.shape[-1] - m - k), dim=-1)
         astray = more[..., 1] if self.ahead.opposed else torch.zeros_like(time)
@@ -317,7 +323,7 @@ class SafetyFilter(Controller):
         lean = Lean(*self.conditions.every(self.conditions.lean, x, t))
         second = torch.tensor(self.degree, device=x.device) == 2
         effect = (lean.slope * self.unit.to(x)).square().sum(-1).sqrt()
-        effect = (effect * torch.where(second, 0.5 * self.hold**2, self.hold)).amax(-1)
+        effect = torch.where(second, 0.5 * self.hold * effect, effect).amax(-1) * self.hold
         further = short / torch.where(effect > 0, effect, 1.0)
         return torch.where(further > 2 * INFEASIBLE, further, 2 * INFEASIBLE)
 
