@@ -13,9 +13,9 @@ from ...lanes.tree import flatten, unflatten
 from ...numerics.checks import fail, positive_real, vector
 from ..loop.controller import Carried, Controller
 from ..planning.ddp import chosen
-from ..safety.quadratic_program import nearest_admissible
 from ..safety.conditions import Constraint, listed
-from ..safety.safety_filter import SafetyFilter
+from ..safety.quadratic_program import nearest_admissible
+from ..safety.safety_filter import INFEASIBLE, SafetyFilter
 from .least_squares import Estimate, LeastSquares
 from .parametric import ChangingPlant, ParametricPlant
 from .windows import IntegralWindows, Window
@@ -182,7 +182,10 @@ class RobustFilter(Controller):
             nearest = nearest_admissible(wanted, normal, demand, least_u, most_u, filter.table)
             u, slack = nearest.point, nearest.shortfall
         assert met is not None
-        return torch.where(met.unsqueeze(-1), wanted, u), margin, torch.where(met, 0.0, slack)
+        slack = torch.where(met, 0.0, slack)
+        outside = filter.hold * filter.conditions.decay.to(x).amax() * -margin  # h < 0 is never fine
+        slack = torch.where(margin < 0, torch.maximum(slack, torch.clamp(outside, min=2 * INFEASIBLE)), slack)
+        return torch.where(met.unsqueeze(-1), wanted, u), margin, slack
 
 
 def _kept(rows: Tensor, before: Carried, after: Carried) -> Carried:

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from ...numerics.checks import fail, non_negative, one_or_each, positive
 from ...numerics.runge_kutta import runge_kutta_step
 from ...systems import Bounds, Plant, StepPlant
+from ..problem.held_plant import Holding
 
 Constraint = Callable[[Tensor, Tensor], Tensor]
 """h(x, t), kept at least 0: states (B, n) and a time, a number in a tensor (), to (B,)."""
@@ -82,6 +83,7 @@ class Conditions(nn.Module):
     ) -> None:
         super().__init__()
         self.plant, self.constraints, self.bounds, self.hold = plant, list(constraints), bounds, hold
+        self.holding = Holding("SafetyFilter", plant, None, 0.5 * hold)
         count = len(self.constraints)
         kept = one_or_each("SafetyFilter", "margin", margin, count)
         self.register_buffer("margin", non_negative("SafetyFilter", "margin", kept))
@@ -182,10 +184,16 @@ class Conditions(nn.Module):
         ability = drift + torch.where(slope == 0, 0.0, farther).sum()
         return Lean(value, rate, drift, slope[0], ability)
 
-    def advance(self, x: Tensor, u: Tensor, length: float | Tensor) -> Tensor:
-        """x after that time, s, by one Runge-Kutta step."""
+    def halfway(self, x: Tensor, u: Tensor) -> Tensor:
+        """x after half a hold."""
+        return self.holding(x, u)[0]
+
+    def advance(self, x: Tensor, u: Tensor, length: Tensor) -> Tensor:
+        """x after half a hold, or half of a row's own, (..., 1) s, where the plant takes single steps."""
+        if not self.holding.classical:
+            return self.halfway(x, u)
         plant = self.plant
-        return runge_kutta_step(lambda at: plant.velocity(at, u), x, length, plant.displaced)
+        return runge_kutta_step(lambda at: plant.velocity(at, u), x, 0.5 * length, plant.displaced)
 
     def level(self, k: int, x: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return h - margin, h' at the resting input (0 where the degree is one) and the square of the
@@ -210,8 +218,8 @@ class Conditions(nn.Module):
 
     def _held(self, k: int, x: Tensor, u: Tensor, t: Tensor) -> tuple[Ends, Tensor, Tensor]:
         """The constraint over the hold, and phi at its end and in its middle."""
-        middle = self.advance(x, u, 0.5 * self.hold)
-        end = self.advance(middle, u, 0.5 * self.hold)
+        middle = self.halfway(x, u)
+        end = self.halfway(middle, u)
         value, rate, _ = self.level(k, x, t)
         between, middle_rate, _ = self.level(k, middle, t + 0.5 * self.hold)
         last = self.level(k, end, t + self.hold)

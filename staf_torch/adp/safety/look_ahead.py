@@ -70,7 +70,10 @@ class LookAhead(nn.Module):
         slow = max(-(found.alone or 0.0), 1e-9)
         periods = min(_CONSTANTS / slow / conditions.hold, float(_FOLLOWED))
         self.periods = max(math.ceil(periods), 20)
-        self.longest = max(conditions.hold, 0.5 / max(_fastest(conditions), 1e-9))
+        single = conditions.holding.classical
+        self.longest = (
+            max(conditions.hold, 0.5 / max(_fastest(conditions), 1e-9)) if single else conditions.hold
+        )
         self.register_buffer("bowl", found.bowl if self.opposed and self.by_policy else None)
         self.bowl: Tensor | None
 
@@ -81,7 +84,7 @@ class LookAhead(nn.Module):
 
         def urgent(given: tuple[Tensor, ...]) -> Tensor:
             x, u, t = given
-            end = of.advance(of.advance(x, u, 0.5 * of.hold), u, 0.5 * of.hold)
+            end = of.halfway(of.halfway(x, u), u)
             lean = Lean(*of.every(of.lean, end, t + of.hold))
             need = _speed(lean).square() > 2 * _URGENT * lean.ability * lean.value
             return (second & (lean.rate < 0) & (lean.value > 0) & need).any(-1).to(x)
@@ -89,8 +92,13 @@ class LookAhead(nn.Module):
         return where_rows(strain > 0, urgent, (x, u, t), torch.zeros_like(t)) > 0
 
     def choose(self, policy: Policy | None, given: tuple[Tensor, ...], where: Tensor) -> Chosen:
-        """The first control whose consequences are fine, else the one of the best: wanted (B, m), found by the
-        conditions (B, m), x (B, n) and t (B,), in the rows asked for."""
+        """The first control whose consequences are fine, else the one of the best, in the rows asked for.
+
+        Args:
+            policy: as in the constructor.
+            given: the wanted control (B, m), the one of the conditions (B, m), x (B, n) and t (B,).
+            where: (B,) bool.
+        """
         wanted, found, x, t = given
         none = torch.zeros_like(t)
         start = wanted, found, x, t, found, none - math.inf, none, where
@@ -140,16 +148,22 @@ class LookAhead(nn.Module):
         a share of the brakes, (B, 1): (B,)."""
         of = self.conditions
         ends = Ends(*of.every(of.over, x, u, t))
-        end = of.advance(of.advance(x, u, 0.5 * of.hold), u, 0.5 * of.hold)
+        end = of.halfway(of.halfway(x, u), u)
         later, time = torch.full_like(t, -math.inf), t + of.hold
         least = torch.where(ends.value < 0, ends.value, 0.0)
         if self.by_brakes and of.apart:
             later = (self._stopped(ends) - least).amin(-1)
         elif self.by_brakes:
             later = (self._braked(end, time, strength) - least).amin(-1)
+        spent = None
         if self.by_policy and policy is not None:
-            later = torch.maximum(later, (self._followed(policy, end, time) - least).amin(-1))
-        return torch.minimum((ends.least(of.hold) - least).amin(-1), later)
+            followed, spent = self._followed(policy, end, time)
+            later = torch.maximum(later, (followed - least).amin(-1))
+        left = torch.minimum((ends.least(of.hold) - least).amin(-1), later)
+        if not self.opposed or spent is None:
+            return left
+        # What cannot be kept is to be over soon: the deepest point alone would let it wait outside for ever.
+        return torch.where(left < -_ROUNDED, -spent - 2 * _ROUNDED, left)
 
     def _stopped(self, ends: Ends) -> Tensor:
         """h - margin where constant brakes have stopped: (B, k)."""
@@ -189,23 +203,30 @@ class LookAhead(nn.Module):
         far = torch.where(second, far, torch.where(ability < 0, -_NEVER * ability, 0.0))
         return torch.where(going.unsqueeze(-1), torch.minimum(least, value - far), least)
 
-    def _followed(self, policy: Policy, x: Tensor, t: Tensor) -> Tensor:
-        """The smallest h - margin under the policy, -inf where it does not come back: (B, k)."""
+    def _followed(self, policy: Policy, x: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+        """The smallest h - margin under the policy, (B, k), and the integral of what is missing, (B,); far
+        below, and far above, where it does not come back."""
         of = self.conditions
         value, rate, _ = of.every(of.level, x, t)
         length = torch.full_like(t, of.hold)
 
         def follow(now: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-            x, t, value, rate, least = now
+            x, t, value, rate, least, spent = now
             x, t, ends = self._moved(x, of.bounds.clip(policy(x)), t, value, rate, length)
-            return x, t, ends.last_value, ends.last_rate, torch.minimum(least, ends.least(of.hold))
+            short = torch.where(ends.last_value < 0, -ends.last_value, 0.0).sum(-1)
+            least, spent = torch.minimum(least, ends.least(of.hold)), spent + of.hold * short
+            return x, t, ends.last_value, ends.last_rate, least, spent
 
-        last, _, _, _, least = repeat(self.periods, follow, (x, t, value, rate, value))
+        start = x, t, value, rate, value, torch.zeros_like(t)
+        last, _, _, _, least, spent = repeat(self.periods, follow, start)
         back = torch.isfinite(last).all(-1)
         if self.bowl is not None:
             back = back & (self._height(last) <= _BACK * self._height(x) + _ROUNDED)
         least = torch.where(torch.isfinite(least), least, -_NEVER)
-        return torch.where(back.unsqueeze(-1), least, least - _NEVER)
+        spent = torch.where(torch.isfinite(spent), spent, _NEVER)
+        return torch.where(back.unsqueeze(-1), least, least - _NEVER), torch.where(
+            back, spent, spent + _NEVER
+        )
 
     def _height(self, x: Tensor) -> Tensor:
         assert self.bowl is not None
@@ -216,9 +237,9 @@ class LookAhead(nn.Module):
         self, x: Tensor, u: Tensor, t: Tensor, value: Tensor, rate: Tensor, length: Tensor
     ) -> tuple[Tensor, Tensor, Ends]:
         of, half = self.conditions, 0.5 * length
-        middle = of.advance(x, u, half.unsqueeze(-1))
+        middle = of.advance(x, u, length.unsqueeze(-1))
         between, *_ = of.every(of.level, middle, t + half)
-        x, t = of.advance(middle, u, half.unsqueeze(-1)), t + length
+        x, t = of.advance(middle, u, length.unsqueeze(-1)), t + length
         return x, t, Ends(value, rate, between, *of.every(of.level, x, t))
 
 

@@ -33,7 +33,7 @@ _FOLLOWS = (
     "the policy is left alone wherever it stays inside by itself, and what it cannot keep is `infeasible`"
 )
 _TOPPLES = "the filter acts nevertheless, as nothing tells what a policy that remembers would do"
-_FOLLOWING = 1000.0  # steps of a feedback law that a control takes where the policy is followed ahead
+_FOLLOWING, _BRAKING = 1000.0, 50.0  # steps of a feedback law that a control takes with such a look ahead
 _SLACK = 1e-9  # in units of the input, from which on the brakes are asked whether they do
 
 
@@ -71,9 +71,22 @@ class SafetyFilter(Controller):
     positive in between too. In the limit of a short hold the condition is phi' >= -decay phi. The quadratic
     program is solved exactly: in closed form for one input, else by comparing all cases.
 
+    Where phi < 0 <= h the condition promises nothing: the constant deceleration that stops at the edge,
+    h'^2 / 2h, is asked for as well. Where bounds limit the inputs, the speed at the end of the hold must be
+    one that they can stop: h'^2 <= 2 a h where the largest h'' = a is one number; else, from where it matters on,
+    the hardest brake is followed until nothing comes nearer. What cannot be kept gets the control of the
+    smallest violation.
+
+    Where braking along an edge drives the rest of the plant away (an unstable zero: the coordinate must first
+    move the wrong way) that is logged at construction with its rate. The policy is then followed ahead for up
+    to 300 periods in place of the brakes: it is left alone where it stays inside and comes back, and else the
+    control is chosen after which it comes back with the least time integral of h < 0; `astray` marks these
+    rows. A controller that remembers is not followed: the filter acts, and the log says so. To plan with
+    `AvoidanceCost` is better there.
+
     A wanted control that satisfies everything is applied bit for bit. Bounds are hard; where they and the
     constraints contradict each other, the bounds hold, the squares of what is missing are least, and `slack`
-    says how much is missing.
+    says how much is missing: positive wherever h < 0 or will be.
 
     Example:
         >>> plant = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
@@ -96,7 +109,9 @@ class SafetyFilter(Controller):
         low: of the inputs, as in `systems.Bounds`; both None for those of the plant.
         high: likewise.
         decay: 1/s, one number or one a constraint: how fast h may fall. Large ones let the policy come nearer
-            to the edge, and need larger controls there. At most 1/dt where the relative degree is two.
+            to the edge, and need larger controls there. At most 1/dt where the relative degree is two. None:
+            1/(5 dt), or less where the relative degree is two and bounds limit the brakes: sqrt(2 a / h) at
+            a usual h > 0 around the equilibrium, from where what is admitted can just be stopped.
         degree: 1 or 2 a constraint, or None: found by trying states around the equilibrium.
         margin: in units of h, one number or one a constraint: h >= margin is kept.
         weight: of the squares of u - policy(x), positive, one an input; all 1 by default.
@@ -106,7 +121,8 @@ class SafetyFilter(Controller):
             first nor its second derivative.
 
     Source: Ames et al., "Control barrier functions: theory and applications", ECC (2019); Nguyen and
-    Sreenath, "Exponential control barrier functions", ACC (2016), for degree two.
+    Sreenath, "Exponential control barrier functions", ACC (2016), for degree two; Gurriet et al., IEEE Access
+    (2020), for what a backup law keeps.
     """
 
     def __init__(
@@ -143,7 +159,8 @@ class SafetyFilter(Controller):
         self.register_buffer("table", cases(count, low_.tolist(), high_.tolist()))
         self.table: Tensor
         self.ahead = LookAhead(self.conditions, self._policy)
-        self.work = _FOLLOWING if self.ahead.by_policy else self.work
+        if self.ahead.acts:
+            self.work = _FOLLOWING if self.ahead.by_policy else (1.0 if self.conditions.apart else _BRAKING)
         for k, rate in enumerate(self.ahead.against.tolist()):
             if rate > 0:
                 _log.warning(_OPPOSED, k, rate, _FOLLOWS if self.ahead.by_policy else _TOPPLES)
@@ -229,9 +246,10 @@ class SafetyFilter(Controller):
 
         Returns:
             ``minimum_margin``, the smallest h over rows and times; ``constraint_violations``, the number of
-            rows with h < 0 at a time; ``infeasible``, the rows in which no admissible control met the
-            condition at a time; ``largest_slack``; ``acted``, the share of the steps in which the control was
-            another than the wanted one within the bounds.
+            rows with h < 0 at a time; ``infeasible``, the rows that at a time were outside or that no
+            admissible control was found to keep inside; ``largest_slack``; ``acted``, the share of the steps
+            in which the control was another than the wanted one within the bounds; ``astray``, the rows in
+            which the policy was followed ahead, as braking along the edge drives the plant away.
         """
         steps, least, most, acted, astray = (result[name][:, -1] for name in Watched._fields[1:])
         last = self.margins(result.state[:, -1], steps * self.hold).amin(-1)
