@@ -213,7 +213,16 @@ MODULES: dict[str, Case] = {
 }
 OTHERS = {
     *("FunctionPlant", "StepPlant", "RatePlant", "SampledProblem"),
-    *("GlobalValue", "BoxFilter", "SafetyFilter", "DetourPlans", "DetourRollout", "FilteredPolicy"),
+    *(
+        "GlobalValue",
+        "BoxFilter",
+        "SafetyFilter",
+        "Conditions",
+        "LookAhead",
+        "DetourPlans",
+        "DetourRollout",
+        "FilteredPolicy",
+    ),
     *("PlanReplay", "RememberedPolicy", "AmongDiscs", "RecedingHorizon", "PathIntegral", "MujocoPlant"),
     *("EnvironmentPlant", "EnergyShaping", "NearOptimal", "SampledRollout", "StrainedPlans"),
     *("ParametricPlant", "ChangingPlant", "AdaptiveActorCritic", "AdaptiveLQR", "DriftLQR"),

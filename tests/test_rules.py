@@ -374,7 +374,7 @@ ABSENT = {
     *("PlantEnv.bound", "PlantEnv.spread", "PlantVectorEnv.spread"),
     *("DirectShooting.iterations", "DirectShooting.intervals"),
     *("simulate.seed", "trajectory.chunk", "near_optimal.dt", "near_optimal.horizon", "report.spread"),
-    *("SafetyFilter.weight", "BoundedInputCost.bound", "PathIntegral.noise"),
+    *("SafetyFilter.weight", "SafetyFilter.decay", "BoundedInputCost.bound", "PathIntegral.noise"),
 }
 """Arguments for which None has a meaning of its own."""
 NOT_ALONE = {("rings", "count"), ("SampledProblem", "dim"), ("StepPlant", "dim")}

@@ -80,7 +80,7 @@ class LookAhead(nn.Module):
     def asked(self, x: Tensor, u: Tensor, t: Tensor, strain: Tensor) -> Tensor:
         """The rows whose brakes may not do: (B, n), (B, m), (B,), (B,) -> (B,) bool."""
         of = self.conditions
-        second = torch.tensor(of.degree, device=x.device) == 2
+        second = torch.tensor(of.degree, dtype=torch.int64, device=x.device) == 2
 
         def urgent(given: tuple[Tensor, ...]) -> Tensor:
             x, u, t = given
@@ -128,7 +128,7 @@ class LookAhead(nn.Module):
     def hardest(self, lean: Lean) -> Tensor:
         """The control that brakes as hard as can be, for what is most urgent: (B, m)."""
         of, like = self.conditions, lean.value
-        second = torch.tensor(of.degree, device=like.device) == 2
+        second = torch.tensor(of.degree, dtype=torch.int64, device=like.device) == 2
         room = torch.where(lean.value > _ROUNDED, lean.value, _ROUNDED)
         able = torch.where(lean.ability > _ROUNDED, lean.ability, _ROUNDED)
         away = torch.where(lean.drift < 0, -lean.drift, 0.0)
@@ -168,15 +168,15 @@ class LookAhead(nn.Module):
     def _stopped(self, ends: Ends) -> Tensor:
         """h - margin where constant brakes have stopped: (B, k)."""
         brakes = [math.inf if a is None else a for a in self.conditions.brakes]
-        most = torch.tensor(brakes).to(ends.value)
+        most = torch.tensor(brakes, dtype=ends.value.dtype, device=ends.value.device)
         speed = torch.where(ends.last_rate < 0, -ends.last_rate, 0.0)
         return ends.last_value - 0.5 * speed.square() / most
 
     def _braked(self, x: Tensor, t: Tensor, strength: Tensor) -> Tensor:
         """The smallest h - margin under the hardest brake until nothing comes nearer: (B, k)."""
         of = self.conditions
-        second = torch.tensor(of.degree, device=x.device) == 2
-        weak = torch.tensor(of.weak, device=x.device)
+        second = torch.tensor(of.degree, dtype=torch.int64, device=x.device) == 2
+        weak = torch.tensor(of.weak, dtype=torch.bool, device=x.device)
         value, rate, _ = of.every(of.level, x, t)
         start = x, t, value, rate, value, value, strength, t == t
         rest = of.plant.resting_input().to(x)
@@ -252,7 +252,8 @@ def opposition(of: Conditions, policy: Policy | None) -> Opposed:
     (plus decay times h) and s = its product with B. A mode that grows there, faster than under the policy
     alone, is an unstable zero: the constraint's coordinate must first move the wrong way.
     """
-    count, none = len(of.constraints), Opposed(torch.zeros(len(of.constraints)), None, None)
+    count = len(of.constraints)
+    none = Opposed(torch.zeros(count, dtype=torch.float64), None, None)
     plant = of.plant
     rest, at = plant.resting_input().double(), plant.equilibrium().double()
     try:
@@ -271,9 +272,9 @@ def opposition(of: Conditions, policy: Policy | None) -> Opposed:
     fast = float(torch.linalg.eigvals(closed).abs().max())
     if alone is not None and alone > _UNSTABLE * fast:
         return none  # the policy brings nothing back by itself
-    rates = torch.zeros(count)
+    rates = torch.zeros(count, dtype=torch.float64)
     x, _ = of._around()
-    normals = [torch.func.vmap(torch.func.grad(lambda x, h=h: h(x.unsqueeze(0), torch.zeros(()).to(x))[0]))
+    normals = [torch.func.vmap(torch.func.grad(lambda x, h=h: h(x.unsqueeze(0), x.new_zeros(()))[0]))
                for h in of.constraints]  # fmt: skip
     for k, normal in enumerate(normals):
         grown = [_growth(c, a, b, closed, float(of.decay[k]), of.degree[k]) for c in normal(x[:8])]

@@ -73,8 +73,8 @@ class SafetyFilter(Controller):
 
     Where phi < 0 <= h the condition promises nothing: the constant deceleration that stops at the edge,
     h'^2 / 2h, is asked for as well. Where bounds limit the inputs, the speed at the end of the hold must be
-    one that they can stop: h'^2 <= 2 a h where the largest h'' = a is one number; else, from where it matters on,
-    the hardest brake is followed until nothing comes nearer. What cannot be kept gets the control of the
+    one that they can stop: h'^2 <= 2 a h where the largest h'' = a is one number; else, from where it matters
+    on, the hardest brake is followed until nothing comes nearer. What cannot be kept gets the control of the
     smallest violation.
 
     Where braking along an edge drives the rest of the plant away (an unstable zero: the coordinate must first
@@ -339,7 +339,7 @@ class SafetyFilter(Controller):
         """What u would have to reach further to win so much of h within the hold, more than `INFEASIBLE`."""
         x, t, short = given
         lean = Lean(*self.conditions.every(self.conditions.lean, x, t))
-        second = torch.tensor(self.degree, device=x.device) == 2
+        second = torch.tensor(self.degree, dtype=torch.int64, device=x.device) == 2
         effect = (lean.slope * self.unit.to(x)).square().sum(-1).sqrt()
         effect = torch.where(second, 0.5 * self.hold * effect, effect).amax(-1) * self.hold
         further = short / torch.where(effect > 0, effect, 1.0)
