@@ -28,6 +28,7 @@ from .shared_programs import shared_program
 from .tree import Tree, flatten, unflatten
 
 _PAYS = 100  # calls of a small batch in plain torch after which it is compiled, however short they are
+_SOON = 30  # calls
 _KEPT = 64  # shapes of calls that are remembered
 WHEN = ("auto", "always", "never")
 _when = "auto"
@@ -203,6 +204,14 @@ class CompiledMethod:
     def compiled(self) -> bool:
         """Return whether a compiled program has served a call."""
         return self._served is not None and self._served.compiled
+
+    @property
+    def compiles_soon(self) -> bool:
+        """Return whether it has run in plain torch, and some more calls like the first will compile it."""
+        if self._served is not None or self._plain is None or not undecided():
+            return False
+        most, (plain, _) = self._settings.pays, self._plain
+        return most - self._asked <= _SOON * (1 + most * plain.seconds() / plain.build)
 
     def hasten(self) -> None:
         """Compile at the next call, whatever it pays."""

@@ -5,8 +5,10 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
+from .compiled_methods import methods_of
 from .plain_time import PlainTime
 from .program import Program
 from .row_independence import generators
@@ -14,6 +16,7 @@ from .tree import Tree
 
 _log = logging.getLogger(__name__)
 _GAIN = 2.0  # builds that a loop must take in plain torch before it is compiled
+_FEW = 16  # steps of a loop that are not worth the count of one
 _SAID, _LONG = 1.5, 3.0  # s after which a loop says that it takes long, and that are then left of it at least
 
 
@@ -29,15 +32,23 @@ class LoopProgram:
         compiled: makes the compiled one; None where there is none.
         times: of the loop, all calls together.
         remedy: what makes it faster, for the log.
+        parts: of the loop; while a method of one will soon be compiled by itself, nobody knows the rest.
     """
 
     def __init__(
-        self, plain: Program, compiled: Callable[[], Program] | None, times: int, *, remedy: str = ""
+        self,
+        plain: Program,
+        compiled: Callable[[], Program] | None,
+        times: int,
+        *,
+        remedy: str = "",
+        parts: Sequence[Any] = (),
     ) -> None:
         self._step, self._make, self._times, self._remedy = plain.step, compiled, times, remedy
         self._plain = Program(self._timed, name=plain.name, compile=False)
         self._compiled: Program | None = None
         self._done, self._spent, self._fastest, self._said = 0, 0.0, math.inf, False
+        self._parts, self._waited = parts, False
 
     def __call__(
         self, carry: Tree, now: Tree = (), row: Tree = (), *, steps: int | None = None, every: int = 1
@@ -56,7 +67,7 @@ class LoopProgram:
 
     def _timed(self, carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
         start = time.perf_counter()
-        if self._make is not None and not self._done:
+        if self._make is not None and not self._done and self._times >= _FEW:
             with PlainTime() as plain:
                 found = self._step(carry, now, row)
             if self._times * plain.seconds() >= _GAIN * plain.build:
@@ -68,13 +79,17 @@ class LoopProgram:
 
     def _look(self, seconds: float) -> None:
         """Log once, if a loop takes long, how long the rest of it takes by the fastest step so far."""
-        self._done, self._spent, self._fastest = (
-            self._done + 1,
-            self._spent + seconds,
-            min(self._fastest, seconds),
-        )
+        self._done, self._spent = self._done + 1, self._spent + seconds
+        self._fastest = min(self._fastest, seconds)
+        if self._said or self._done < 2 or self._spent < _SAID:
+            return
+        methods = [method for part in self._parts for method in methods_of(part)]
+        waited, self._waited = self._waited, any(method.compiles_soon for method in methods)
+        if waited or self._waited:  # or in the step after the last one was compiled
+            self._fastest = math.inf
+            return
         rest = self._fastest * (self._times - self._done)
-        if self._said or self._done < 2 or self._spent < _SAID or rest < _LONG:
+        if rest < _LONG:
             return
         self._said = True
         _log.warning(

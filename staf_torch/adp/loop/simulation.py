@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import logging
 import math
 from collections.abc import Callable, Sequence
@@ -210,13 +211,13 @@ def simulate(
 
 def _beginning(loop: ClosedLoop, plain: Program, steps: int) -> LoopProgram:
     """Return the program of a loop that few and cheap steps would not repay to compile."""
-    if not loop.system.traceable:
-        return LoopProgram(plain, None, steps, remedy=": a plant that is no torch is called at every step")
-    if any(getattr(part, "costly", False) for part in loop.controller.modules()):
-        remedy = ": `compile=True` compiles this controller, too, which takes up to a minute, once"
-        return LoopProgram(plain, None, steps, remedy=remedy)
-    remedy = ": `compile=True` compiles it, where it is torch all through"
-    return LoopProgram(plain, lambda: program(loop, True), steps, remedy=remedy)
+    parts, compiled, remedy = list(loop.modules()), None, "a plant that is no torch is called at every step"
+    if loop.system.traceable:
+        remedy = "`compile=True` compiles this controller, too, which takes up to a minute, once"
+    if loop.system.traceable and not any(getattr(part, "costly", False) for part in parts):
+        remedy = "`compile=True` compiles it, where it is torch all through"
+        compiled = functools.partial(program, loop, True)
+    return LoopProgram(plain, compiled, steps, remedy=f": {remedy}", parts=parts)
 
 
 @dataclasses.dataclass(frozen=True)
