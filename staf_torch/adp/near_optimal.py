@@ -21,6 +21,7 @@ from ..systems.bounds import Limit
 from .loop.controller import LQR, Controller, Feedback
 from .loop.simulation import simulate
 from .planning.global_value import GlobalValue
+from .planning.global_value_sizes import box_of
 from .planning.receding_horizon import BoundedPlans, StrainedPlans
 from .planning.shooting import DirectShooting
 from .policies.rollout import ball_directions
@@ -29,7 +30,7 @@ from .problem.cost import Cost
 from .problem.held_linear import held_stability
 from .problem.rules import check_endless, check_still, held_period, regulated, slowest, warn_if_short
 from .problem.sampled import SampledProblem
-from .reach import Reach, arrived, box_of, drawn, extended
+from .reach import Reach, arrived, drawn, extended
 
 _log = logging.getLogger(__name__)
 _DECAY = 2.0  # time constants of the slowest mode of the LQR in the horizon

@@ -16,8 +16,8 @@ from ..systems.user_plants import FunctionPlant
 from .loop.controller import LQR
 from .planning.ddp import BoxDDP
 from .planning.global_value import GlobalValue
-from .planning.global_value_learning import best_from, learn_global_value
-from .planning.receding_horizon import best_held
+from .planning.global_value_learning import best_from
+from .planning.global_value_sizes import global_value_of
 from .policies.sampled_rollout import SampledRollout
 from .problem.cost import Cost
 from .problem.sampled import SampledProblem
@@ -28,8 +28,7 @@ REGULATED = 1e-2  # share of the distance from the set-point that is left
 _LOOK = 16  # periods after which it is looked who arrived
 _BUDGET = 0.4  # s that following the base may take
 _DIMS, _INPUTS = 6, 2  # at most, of a plant whose global value is learnt
-_STEPS = (60, 480)  # periods of a trajectory of the global value, at least and at most
-_SEED = 7
+_SEED = 7  # of the sample
 _DEAR = 4.0  # times the value of the LQR that it may cost within its bounds, to be a base
 _GOOD = 1.02  # mean cost over the best known, beyond which the log warns
 
@@ -43,13 +42,6 @@ class Reach(NamedTuple):
     over_best: float | None  # mean cost over that of the best trajectories known, of the regulated
     base: float | None  # share that the LQR within its bounds regulates
     note: str = ""  # why nobody looked, or why there is no global value
-
-
-def box_of(plant: Plant, dim: int) -> Tensor:
-    """Half the width of a plant's box: its ``spread``, and of its angles all of them: (n,)."""
-    width = torch.full((dim,), float(plant.spread), dtype=torch.float64)
-    width[list(plant.periodic)] = math.pi
-    return width
 
 
 def drawn(cost: Cost, width: Tensor, count: int, seed: int) -> Tensor:
@@ -108,8 +100,8 @@ def extended(
             "near_optimal: the LQR regulates %.0f %% of %d states of the box %s: learning a global value",
             *(100 * share, len(x0), _shown(box)),
         )
-        memory = learned(problem, box, settles)
-    except UnreachableError as error:
+        memory = global_value_of(problem, box, settles)
+    except ValueError as error:
         if way == "global":
             raise fail("near_optimal", "reach", f"must be local here: {error}", way) from error
         _log.warning(
@@ -166,15 +158,11 @@ def follow_base(policy: SampledRollout, x0: Tensor, periods: int) -> Followed:
     return Followed(good, paid, known)
 
 
-class UnreachableError(ValueError):
-    """Why a plant has no global value."""
-
-
 def sampled_problem(plant: Plant, cost: Cost, period: float, x: Tensor) -> SampledProblem:
     """The plant and its cost in steps, as a global value needs them. x (B, n) are states of the box.
 
     Raises:
-        UnreachableError: that says why there is none.
+        ValueError: that says why there is none.
     """
     if isinstance(plant, FunctionPlant):
         levels = Bounds(-1.0, 1.0, cost.inputs) if cost.bounds is None else cost.bounds
@@ -183,49 +171,10 @@ def sampled_problem(plant: Plant, cost: Cost, period: float, x: Tensor) -> Sampl
         plant = plant.in_torch(x, low + at * (high - low)) or plant
     if not plant.traceable:
         rule = "torch all through, or one function in NumPy that torch can follow (no np.array, no branches)"
-        raise UnreachableError(f"it needs a plant that is {rule}")
+        raise ValueError(f"it needs a plant that is {rule}")
     if cost.dim > _DIMS or cost.inputs > _INPUTS:
-        raise UnreachableError(f"a global value is learnt of at most {_DIMS} states and {_INPUTS} inputs")
-    try:
-        return SampledProblem.of(plant, cost, dt=period)
-    except ValueError as error:
-        raise UnreachableError(str(error)) from error
-
-
-def learned(problem: SampledProblem, width: Tensor, steps: int) -> GlobalValue:
-    """The global value of a box by the sizes that two states need, and four, in seconds to a minute.
-
-    Args:
-        problem: plant, cost and bounds in steps.
-        width: half the width of the box, (n,).
-        steps: of a trajectory, to begin with: twice as many where fewer than nine of ten arrive.
-
-    Raises:
-        UnreachableError: if no trajectory arrives.
-    """
-    large = problem.dim > 2
-    sizes = {"trajectories": 120, "rounds": 4, "states": 100} if large else {"trajectories": 80, "rounds": 3}
-    ahead = {"candidates": 48, "lookahead": 60} if large else {"candidates": 24, "lookahead": 40}
-    try:
-        count = _enough_steps(problem, width, min(max(steps, _STEPS[0]), _STEPS[1] // 2))
-        more = {"states": 100, **sizes, **ahead, "seed": _SEED}
-        return learn_global_value(problem, width, steps=count, enough=0.97, **more)  # type: ignore[arg-type]
-    except ValueError as error:
-        raise UnreachableError(str(error)) from error
-
-
-def _enough_steps(problem: SampledProblem, width: Tensor, steps: int) -> int:
-    """Steps in which nine of ten plans arrive at the goal; else the most."""
-    generator = torch.Generator().manual_seed(_SEED)
-    uniform = torch.rand(STATES, problem.dim, dtype=torch.float64, generator=generator)
-    x0 = problem.goal + width * (2 * uniform - 1)
-    while steps < _STEPS[1]:
-        found = best_held(BoxDDP(problem, steps=steps, iterations=40, tolerance=1e-5), x0)
-        late = found.value[:, -1] > REGULATED * found.cost
-        if float(late.double().mean()) <= 0.1:
-            break
-        steps = min(2 * steps, _STEPS[1])
-    return steps
+        raise ValueError(f"a global value is learnt of at most {_DIMS} states and {_INPUTS} inputs")
+    return SampledProblem.of(plant, cost, dt=period)
 
 
 class Compared(NamedTuple):

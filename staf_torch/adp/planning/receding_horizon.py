@@ -204,8 +204,13 @@ def _following(found: Trajectories) -> Following:
 def best_held(search: BoxDDP, x: Tensor) -> Trajectories:
     """The cheapest trajectories from x (B, n) that a search reaches from the linear feedback of the goal, and
     from each corner of the bounds, held for 2 to 30 periods before it."""
+    return held_plans(search, x, 1)[0]
+
+
+def held_plans(search: BoxDDP, x: Tensor, best: int) -> list[Trajectories]:
+    """The cheapest of these trajectories, the next ones, ...: so many."""
     if search.problem.unregulated:  # which has several of its own
-        return search.solve(x)
+        return [search.solve(x)]
     control, feedback = held_controls(search.problem, search.steps)
     count, b = len(control), len(x)
     goal = search.problem.goals(x, search.steps)[:, :-1]
@@ -215,7 +220,8 @@ def best_held(search: BoxDDP, x: Tensor) -> Trajectories:
         Reference(goal.repeat(count, 1, 1), feedback.repeat_interleave(b, 0)),
     )
     cost = torch.where(torch.isfinite(found.cost), found.cost, torch.inf).view(count, b)
-    return rows_of(found, cost.argmin(0) * b + torch.arange(b))
+    order = cost.argsort(dim=0, stable=True)[:best]
+    return [rows_of(found, first * b + torch.arange(b)) for first in order]
 
 
 class BoundedPlans:

@@ -14,7 +14,7 @@ from ....numerics.linalg import positive_semidefinite
 from ....systems import ControlAffineSystem, Linear, Plant
 from ....systems.bounds import Limit
 from ...loop.controller import LQR, Policy, Value
-from ...problem.cost import Cost, Matrix, quadratic, square
+from ...problem.cost import BoundedInputCost, Cost, Matrix, QuadraticCost, quadratic, square
 from ...problem.rules import (
     check_regulates,
     check_still,
@@ -23,9 +23,12 @@ from ...problem.rules import (
     restless,
     set_point,
 )
-from ..trajectories import chosen
+from ..trajectories import Trajectories, chosen
+from .merging import ROWS, cheapest, joined, merged, selected
+from .mesh import graded, halved, split
 from .newton import Interval, MeshPlan, NewtonSolution, follow, minimise, replay
 from .optimum import Optimum
+from .plan_search import PlanSearch
 from .starts import guesses, guided
 
 _log = logging.getLogger(__name__)
@@ -33,14 +36,10 @@ _DECAY = 9.2  # time constants of the slowest mode in the horizon: it falls to 1
 _RESOLVED = 0.5  # mean interval in time constants of the fastest mode
 _LEAST = 80  # intervals
 _MOST = 120  # intervals that are chosen at most where inputs are bounded
-_ROWS = 256  # states solved from at once: a graph of second derivatives is kept for each
 _GAP = 1e-3  # share of the value by which a stationary control may miss the minimum of the Hamiltonian
-_SAME = 1e-4  # relative, of the values of two starts that found the same
 _NEAR = (0.5, 2.0)  # value over the LQR's, inside which one start is believed,
 _PLAIN = 1.5  # where following the base costs at most so many times what was found from it
-_MIRRORED = 1e-9  # relative difference of cost below which two guesses are one and its mirror image
 _REST = 1e-3  # share of the value that the terminal cost may be, before the horizon grows
-_GRADING = 6.0  # ratio of a mesh's last interval to the first
 _DOUBLINGS = 3  # of the horizon
 _SPLINES = 8  # random guesses
 _ROUNDED = 4.0  # rounding units of the state, within which it is at the set-point
@@ -61,9 +60,12 @@ class DirectShooting:
     control minimises the Hamiltonian in u to a share of 1e-3 of the value: a saturated control without a
     slope does not pass. A row whose value is not near its LQR's, or is much less than the base costs, is
     started from more guesses: constant controls at the bounds for a while, none, random splines, each
-    followed by the base policies; the cheapest of them that are no mirror images are improved. It has
-    converged if two starts found the same lowest value to 1e-4, else its `reason` says ``local``. A row that
-    is not stationary is NaN, and its `reason` says why.
+    followed by the base policies; with bounds also the plans that `BoxDDP` reaches in equal steps from
+    holding bounds for a while. The cheapest that are no mirror images are improved. Where no two of them
+    found the same lowest value to 1e-4, with bounds and at most two states, so is the plan of a memory of the
+    plant's box (`learn_global_value`, once). A row has converged if two starts found the same, else its
+    `reason` says ``local``. A row that is not stationary is NaN, and its `reason` says why. With bounds, but
+    for a convex problem, the mesh has equal intervals; else they grow by a factor of six along it.
 
     Every control that is found is admissible, so the value is an upper bound of V*, but for the errors of
     the Runge-Kutta steps and of the horizon, which `Optimum` reports.
@@ -142,6 +144,7 @@ class DirectShooting:
         self.terminal = self._end(terminal)
         x = set_point(system, cost)[0]
         self.stays = not restless(system, cost) and float(self.terminal(x.unsqueeze(0)).abs()) <= _NOTHING
+        self.quadratic_end = not callable(cost.ending if terminal is None else terminal)
         self.stated = (horizon, intervals)
         chosen = _DECAY / rates[0] if horizon is None else horizon
         self.horizon = positive_real("DirectShooting", "horizon", chosen)
@@ -157,6 +160,7 @@ class DirectShooting:
         self.iterations = integer("DirectShooting", "iterations", steps, least=1)
         self.starts = integer("DirectShooting", "starts", starts, least=1)
         self.seed = integer("DirectShooting", "seed", seed, least=0)
+        self._searches: dict[tuple[float, int], PlanSearch | None] = {}
 
     def _regulator(self, horizon: float | None, ends: bool) -> LQR | None:
         """The LQR of the problem; None where there is none and a horizon does without.
@@ -217,11 +221,11 @@ class DirectShooting:
         with torch.no_grad():
             parts = [
                 self._solve(
-                    rows, None if warm is None else selected(warm, k * _ROWS + torch.arange(len(rows)))
+                    rows, None if warm is None else selected(warm, k * ROWS + torch.arange(len(rows)))
                 )
-                for k, rows in enumerate(x0.split(_ROWS))
+                for k, rows in enumerate(x0.split(ROWS))
             ]
-        return parts[0] if len(parts) == 1 else _joined(parts)
+        return parts[0] if len(parts) == 1 else joined(parts)
 
     def _solve(self, x0: Tensor, warm: Optimum | None) -> Optimum:
         horizon, intervals = self.horizon, self.intervals
@@ -237,7 +241,7 @@ class DirectShooting:
 
     def _over(self, x0: Tensor, horizon: float, intervals: int, warm: Optimum | None) -> Optimum:
         """The optima over a horizon: from the base, and where that is not enough from more starts."""
-        time = graded(horizon, intervals // 2).to(x0)
+        time = self._mesh(horizon, intervals // 2).to(x0)
         base = self.bases[0]
         start = follow(self, _always(base), x0, time.diff())
         found = self._improve(start, time, x0, base)
@@ -248,20 +252,63 @@ class DirectShooting:
         plans = self._guessed(x0[rows], time)
         if warm is not None:
             plans.append(self._warm(warm, x0[rows], rows, time))
-        plans = _cheapest(plans, self.starts, start.cost[rows])
+        search = self._search(time)
+        if search is not None and self.stage.cost.bounds is not None:
+            plans += [self._replayed(plan, time.diff()) for plan in search.held(x0[rows])]
+        plans = cheapest(plans, self.starts, start.cost[rows])
+        if self.stage.cost.output is not None:  # plans that end with the base see one valley of the cost
+            plans.append(follow(self, _always(self._resting), x0[rows], time.diff()))
+        found = self._several(found, rows, plans, time)
+        local = (hard & ~found.converged & torch.isfinite(found.value)).nonzero().flatten()
+        if search is None or not len(local):
+            return found
+        plans = [self._replayed(plan, time.diff()) for plan in search.remembered(x0[local])]
+        return self._several(found, local, plans, time)
+
+    def _mesh(self, horizon: float, intervals: int) -> Tensor:
+        """Times of the coarse mesh: in equal steps where plans are searched in such."""
+        if self._graded():
+            return graded(horizon, intervals)
+        return torch.linspace(0, horizon, intervals + 1, dtype=torch.float64)
+
+    def _several(self, found: Optimum, rows: Tensor, plans: list[MeshPlan], time: Tensor) -> Optimum:
+        """The best of what was found and of what several plans lead to, in some rows."""
+        if not plans:
+            return found
         # All starts of all rows are one batch: what a step costs hardly depends on its size.
         together = MeshPlan(*(torch.cat(parts) for parts in zip(*plans, strict=True)))
-        improved = self._improve(together, time, x0[rows].repeat(len(plans), 1), base)
+        x0 = together.state[:, 0]
+        improved = self._improve(together, time, x0, self.bases[0])
         places = torch.arange(len(rows))
         several = [selected(improved, k * len(rows) + places) for k in range(len(plans))]
-        return _merged(found, rows, several)
+        return merged(found, rows, several)
+
+    def _search(self, time: Tensor) -> PlanSearch | None:
+        """The search in the steps of a mesh; None where these are not equal."""
+        stage, key = self.stage, (float(time[-1]), len(time) - 1)
+        if self._graded():
+            return None
+        if key not in self._searches:
+            self._searches[key] = PlanSearch.of(stage.system, stage.cost, key[0] / key[1], key[1])
+        return self._searches[key]
+
+    def _replayed(self, plan: Trajectories, lengths: Tensor) -> MeshPlan:
+        """A plan in equal steps on a mesh of the same steps: constant on each, with its feedback."""
+        control, feedback = self.stage.cost.unsaturated(plan.control), plan.feedback
+        steps = MeshPlan(plan.state, torch.cat((control, control), dim=-1), plan.cost)
+        twice, none = torch.cat((feedback, feedback), dim=-2), torch.zeros_like(steps.control)
+        return replay(self.stage, steps, plan.state[:, 0], lengths, self.terminal, twice, none)
 
     def _believed(self, found: Optimum, x0: Tensor, followed: Tensor) -> Tensor:
         """Rows in which one start is enough, given what following the base costs there: (B,) bool."""
         if self.alone:  # a kink or a saddle looks stationary
             return torch.zeros_like(found.converged)
-        if self.lqr is None or isinstance(self.stage.system, Linear):
+        if self._convex():
             return found.converged
+        if self.stage.cost.output is not None:  # with valleys that the LQR does not know
+            return found.converged & self._rests(x0, found.value)
+        if self.lqr is None:
+            return found.converged & (followed <= _PLAIN * found.value)
         ratio = found.value / self.lqr.value(x0)
         near = (ratio > _NEAR[0]) & (ratio < _NEAR[1]) & (followed <= _PLAIN * found.value)
         return found.converged & (self._rests(x0, found.value) | near)
@@ -271,6 +318,16 @@ class DirectShooting:
         rounding = _ROUNDED * torch.finfo(x0.dtype).eps * x0.abs()
         here = (self.stage.cost.deviation(x0).abs() <= rounding).all(-1) | (value == 0)
         return here & self.stays
+
+    def _graded(self) -> bool:
+        """Whether intervals grow along a mesh: without bounds, or where one start finds the optimum."""
+        return self.stage.cost.bounds is None or self._convex()
+
+    def _convex(self) -> bool:
+        """Whether every stationary plan is the optimum: a linear plant, and a cost without an output."""
+        system, cost = self.stage.system, self.stage.cost
+        plain = type(cost) in (QuadraticCost, BoundedInputCost) and cost.output is None
+        return isinstance(system, Linear) and not system.periodic and plain and self.quadratic_end
 
     def _guessed(self, x0: Tensor, time: Tensor) -> list[MeshPlan]:
         lengths, horizon = time.diff(), float(time[-1])
@@ -378,124 +435,8 @@ def _why(known: bool, solution: NewtonSolution, left: float, row: int) -> str:
     return f"the control misses the minimum of the Hamiltonian by {left:.2g} of the value: it is saturated"
 
 
-def _cheapest(plans: list[MeshPlan], count: int, used: Tensor) -> list[MeshPlan]:
-    """The ``count`` cheapest of several plans that differ from each other and from one used, row by row.
-
-    Two that cost the same are mirror images, or one and the same: they would find the same, and agree with
-    nobody but themselves. All but the first of them come last, as plans that cost inf.
-
-    Args:
-        plans: of the rows.
-        count: at most.
-        used: cost of the plan that was improved already, (B,).
-    """
-    costs = torch.stack([used, *(plan.cost for plan in plans)])  # (1 + S, B)
-    apart = (costs.unsqueeze(1) - costs).abs() > _MIRRORED * costs.abs()
-    same = ~apart & torch.isfinite(costs)
-    earlier = torch.ones_like(same[..., 0]).tril(-1).unsqueeze(-1)  # plan i after plan j
-    costs = torch.where((same & earlier).any(1), torch.inf, costs)[1:]
-    order = costs.argsort(dim=0, stable=True)[: min(count, len(plans))]
-    rows = torch.arange(costs.shape[1])
-    state, control = (torch.stack([getattr(p, name) for p in plans]) for name in ("state", "control"))
-    return [MeshPlan(state[k, rows], control[k, rows], costs[k, rows]) for k in order]
-
-
-def selected(optimum: Optimum, rows: Tensor) -> Optimum:
-    """Some rows of a result."""
-    parts = {name: part[rows] for name, part in _tensors(optimum).items()}
-    reason = tuple(optimum.reason[row] for row in rows.tolist())
-    return optimum._replace(**parts, reason=reason)
-
-
-def _tensors(optimum: Optimum) -> dict[str, Tensor]:
-    """Return the tensors with a row a state."""
-    return {name: part for name, part in optimum._asdict().items() if name not in ("time", "reason")}
-
-
-def _merged(found: Optimum, rows: Tensor, several: list[Optimum]) -> Optimum:
-    """The best of several starts in some rows, and the others as they were."""
-    every = [selected(found, rows), *several]
-    values = torch.stack([each.value.nan_to_num(nan=torch.inf) for each in every])  # (S, B')
-    best = values.argmin(0)
-    same = values <= values.amin(0) + _SAME * values.amin(0).abs()
-    known = torch.stack([each.converged for each in every])
-    count = (same & known).sum(0)  # starts that found the lowest value
-    places = torch.arange(len(rows))
-    columns = {}
-    for name, whole in _tensors(found).items():
-        chosen = torch.stack([getattr(each, name) for each in every])[best, places]
-        columns[name] = whole.index_copy(0, rows, chosen)
-    spent = torch.stack([each.iterations for each in every]).sum(0)
-    columns["iterations"] = found.iterations.index_copy(0, rows, spent)
-    reasons, converged = list(found.reason), found.converged.clone()
-    for place, row in enumerate(rows.tolist()):
-        finite = [float(v) for v in values[:, place] if math.isfinite(v)]
-        converged[row] = int(count[place]) > 1 and bool(finite)
-        if not finite:
-            reasons[row] = found.reason[row]
-        else:
-            most, least = max(finite), min(finite)
-            others = f"up to {most / least:.3g} times as much" if least > 0 else f"{least:.4g} to {most:.4g}"
-            local = f"local: one start alone found it, others {others}"
-            own = every[int(best[place])].reason[place]
-            reasons[row] = "" if bool(converged[row]) else f"local: {own}" if own else local
-    columns["converged"] = converged
-    return found._replace(**columns, reason=tuple(reasons))
-
-
-def _joined(parts: list[Optimum]) -> Optimum:
-    """Results of pieces of a batch.
-
-    Raises:
-        ValueError: if a piece needed a longer horizon than another.
-    """
-    longest = max(parts, key=lambda part: float(part.time[-1])).time
-    if any(not torch.equal(part.time, longest) for part in parts):
-        raise ValueError(
-            "`DirectShooting.solve` needed different horizons for different states: state a `horizon` of "
-            f"{float(longest[-1]):.4g} s, or solve at most {_ROWS} states at once."
-        )
-    columns = {name: torch.cat([_tensors(part)[name] for part in parts]) for name in _tensors(parts[0])}
-    reason = tuple(one for part in parts for one in part.reason)
-    return parts[0]._replace(**columns, reason=reason)
-
-
 def _rates(system: Plant, lqr: LQR) -> tuple[float, float]:
     """The slowest decay and the fastest rate of the LQR's modes, 1/s."""
     a, b = system.linearisation(lqr.cost.target, lqr.cost.target_input)
     modes = torch.linalg.eigvals(a.to(lqr.p) - b.to(lqr.p) @ lqr.k)
     return float(-modes.real.max()), float(modes.abs().max())
-
-
-def graded(horizon: float, intervals: int) -> Tensor:
-    """Times of a mesh whose intervals grow in geometric progression: (N + 1,) from 0 to the horizon."""
-    power = math.log(_GRADING) * torch.arange(intervals + 1, dtype=torch.float64) / max(1, intervals - 1)
-    return horizon * power.expm1() / power[-1].expm1()
-
-
-def halved(time: Tensor) -> Tensor:
-    """Return the times and those half-way: (N + 1,) -> (2N + 1,)."""
-    middle = 0.5 * (time[1:] + time[:-1])
-    return torch.cat((time[:1], torch.stack((middle, time[1:]), dim=-1).flatten()))
-
-
-def split(stage: Interval, plan: MeshPlan, feedback: Tensor, lengths: Tensor) -> tuple[MeshPlan, Tensor]:
-    """Split the intervals of a plan in half: the same control, and a feedback around it.
-
-    Args:
-        stage: of the problem.
-        plan: on N intervals.
-        feedback: around it, (B, N, 2m, n).
-        lengths: of the N intervals, (N,).
-
-    Returns:
-        A plan on 2N intervals (of the old cost) and its feedback (B, 2N, 2m, n).
-    """
-    first, last = plan.control.chunk(2, dim=-1)
-    middle = 0.5 * (first + last)
-    early, late = torch.cat((first, middle), dim=-1), torch.cat((middle, last), dim=-1)
-    between, _ = stage.advance(plan.state[:, :-1], early, 0.5 * lengths.expand(plan.control.shape[:2]))
-    state = torch.stack((plan.state[:, :-1], between), dim=2).flatten(1, 2)
-    state = torch.cat((state, plan.state[:, -1:]), dim=1)
-    control = torch.stack((early, late), dim=2).flatten(1, 2)
-    return MeshPlan(state, control, plan.cost), feedback.repeat_interleave(2, dim=1)

@@ -1,0 +1,105 @@
+"""Which of several starts are improved, and the best of what they lead to, row by row."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from .newton import MeshPlan
+from .optimum import Optimum
+
+ROWS = 256  # states solved from at once: a graph of second derivatives is kept for each
+_SAME = 1e-4  # relative, of the values of two starts that found the same
+_MIRRORED = 1e-9  # relative difference of cost below which two guesses are one and its mirror image
+_LONE = "local: one start alone"
+
+
+def cheapest(plans: list[MeshPlan], count: int, used: Tensor) -> list[MeshPlan]:
+    """The ``count`` cheapest of several plans that differ from each other and from one used, row by row.
+
+    Two that cost the same are mirror images, or one and the same: they would find the same, and agree with
+    nobody but themselves. All but the first of them come last, as plans that cost inf.
+
+    Args:
+        plans: of the rows.
+        count: at most.
+        used: cost of the plan that was improved already, (B,).
+    """
+    costs = torch.stack([used, *(plan.cost for plan in plans)])  # (1 + S, B)
+    apart = (costs.unsqueeze(1) - costs).abs() > _MIRRORED * costs.abs()
+    same = ~apart & torch.isfinite(costs)
+    earlier = torch.ones_like(same[..., 0]).tril(-1).unsqueeze(-1)  # plan i after plan j
+    costs = torch.where((same & earlier).any(1), torch.inf, costs)[1:]
+    order = costs.argsort(dim=0, stable=True)[: min(count, len(plans))]
+    rows = torch.arange(costs.shape[1])
+    state, control = (torch.stack([getattr(p, name) for p in plans]) for name in ("state", "control"))
+    return [MeshPlan(state[k, rows], control[k, rows], costs[k, rows]) for k in order]
+
+
+def selected(optimum: Optimum, rows: Tensor) -> Optimum:
+    """Some rows of a result."""
+    parts = {name: part[rows] for name, part in _tensors(optimum).items()}
+    reason = tuple(optimum.reason[row] for row in rows.tolist())
+    return optimum._replace(**parts, reason=reason)
+
+
+def _tensors(optimum: Optimum) -> dict[str, Tensor]:
+    """Return the tensors with a row a state."""
+    return {name: part for name, part in optimum._asdict().items() if name not in ("time", "reason")}
+
+
+def merged(found: Optimum, rows: Tensor, several: list[Optimum]) -> Optimum:
+    """The best of several starts in some rows, and the others as they were."""
+    every = [selected(found, rows), *several]
+    values = torch.stack([each.value.nan_to_num(nan=torch.inf) for each in every])  # (S, B')
+    best = values.argmin(0)
+    same = values <= values.amin(0) + _SAME * values.amin(0).abs()
+    known = torch.stack([_stationary(each) for each in every])
+    count = (same & known).sum(0)  # starts that found the lowest value
+    places = torch.arange(len(rows))
+    columns = {}
+    for name, whole in _tensors(found).items():
+        chosen = torch.stack([getattr(each, name) for each in every])[best, places]
+        columns[name] = whole.index_copy(0, rows, chosen)
+    spent = torch.stack([each.iterations for each in every]).sum(0)
+    columns["iterations"] = found.iterations.index_copy(0, rows, spent)
+    reasons, converged = list(found.reason), found.converged.clone()
+    for place, row in enumerate(rows.tolist()):
+        finite = [float(v) for v in values[:, place] if math.isfinite(v)]
+        converged[row] = int(count[place]) > 1 and bool(finite)
+        if not finite:
+            reasons[row] = found.reason[row]
+        else:
+            most, least = max(finite), min(finite)
+            others = f"up to {most / least:.5g} times as much" if least > 0 else f"{least:.4g} to {most:.4g}"
+            local = f"{_LONE} found it, others {others}"
+            own = every[int(best[place])].reason[place]
+            lone = not own or own.startswith(_LONE)
+            reasons[row] = "" if bool(converged[row]) else local if lone else f"local: {own}"
+    columns["converged"] = converged
+    return found._replace(**columns, reason=tuple(reasons))
+
+
+def _stationary(optimum: Optimum) -> Tensor:
+    """Rows of a start that it ended well in, also those that no other start agreed with, (B,) bool."""
+    lone = [reason.startswith(_LONE) for reason in optimum.reason]
+    return optimum.converged | torch.tensor(lone, dtype=torch.bool)
+
+
+def joined(parts: list[Optimum]) -> Optimum:
+    """Results of pieces of a batch.
+
+    Raises:
+        ValueError: if a piece needed a longer horizon than another.
+    """
+    longest = max(parts, key=lambda part: float(part.time[-1])).time
+    if any(not torch.equal(part.time, longest) for part in parts):
+        raise ValueError(
+            "`DirectShooting.solve` needed different horizons for different states: state a `horizon` of "
+            f"{float(longest[-1]):.4g} s, or solve at most {ROWS} states at once."
+        )
+    columns = {name: torch.cat([_tensors(part)[name] for part in parts]) for name in _tensors(parts[0])}
+    reason = tuple(one for part in parts for one in part.reason)
+    return parts[0]._replace(**columns, reason=reason)
