@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import logging
 import math
+from collections.abc import Sequence
 from typing import Any, Self
 
 import torch
@@ -14,13 +15,14 @@ from ..centers import ball, rings
 from ..centers.layouts import RING_COUNTS
 from ..kernels import NAMED, Kernel
 from ..numerics.checks import choice, fail, flag, integer, positive_real, real
-from .estimator import StreamEstimator
+from .estimator import StreamEstimator, Streams
 from .filter_streams import FilterStreams
 from .kalman_filter import LocalFilter, StreamState
 from .local_functions import LocalFunctions
 from .samples import lapses, like_given, pair, tensor_of
 from .smoothing import smooth_record
 from .tuning import Tuning, tuned_streams, tuning
+from .turning_streams import TurningStreams, turned_in_time
 
 _log = logging.getLogger(__name__)
 _NAME = "StaFRegressor"
@@ -64,6 +66,8 @@ class StaFRegressor(StreamEstimator):
         forgetting: in (0, 1]: the share of what was learned that is still believed one unit of time later.
         follow: the centers stay until x has moved by follow * radius, not negative: by default until it
             leaves their ball.
+        periodic: coordinates of x that are angles in rad: a sample is turned by whole turns to within pi of
+            the latest of its stream. `MixtureRegressor` has none: give it sine and cosine.
         robust: standard deviations beyond which an error counts no more than there (Huber); None for any.
         scaling: whether x and y are brought to mean 0 and variance 1, learned from the first 40 samples. Then
             radius, noise and amplitude are in these units.
@@ -94,6 +98,7 @@ class StaFRegressor(StreamEstimator):
         amplitude: float = 1.0,
         forgetting: float = 0.999,
         follow: float = 1.0,
+        periodic: Sequence[int] = (),
         robust: float | None = None,
         scaling: bool = False,
     ) -> None:
@@ -105,6 +110,7 @@ class StaFRegressor(StreamEstimator):
         self.amplitude = amplitude
         self.forgetting = forgetting
         self.follow = follow
+        self.periodic = periodic
         self.robust = robust
         self.scaling = scaling
 
@@ -128,6 +134,7 @@ class StaFRegressor(StreamEstimator):
             y: x's shape without n, or with K in place of n for K outputs.
         """
         states, values = pair(f"{_NAME}.tune", x, y, (2, 3))
+        states = turned_in_time(states, self._angles(states.shape[-1]))
         self.reset()
         targets = values if values.dim() == states.dim() else values.unsqueeze(-1)
         rows = [part.unsqueeze(1) if states.dim() == 2 else part for part in (states, targets)]
@@ -147,9 +154,10 @@ class StaFRegressor(StreamEstimator):
             learned stays as it is.
         """
         states, values = pair(f"{_NAME}.smooth", x, y, (2, 3))
+        states = turned_in_time(states, self._angles(states.shape[-1]))
         steps, twin = lapses(f"{_NAME}.smooth", time, states), copy.copy(self).reset()
         twin._prepare(states[0], values[0])
-        streams = twin._streams_
+        streams = twin._streams_.inner if isinstance(twin._streams_, TurningStreams) else twin._streams_
         assert isinstance(streams, FilterStreams)
         rows = (len(states), streams.count, -1)
         whole = torch.ones(rows[:2], dtype=torch.float64) if steps is None else steps.expand(rows[:2])
@@ -162,7 +170,19 @@ class StaFRegressor(StreamEstimator):
         found = mean * spread[:, n:] + center[:, n:], deviation * spread[:, n:]
         return like_given(y, found[0].reshape(values.shape)), like_given(y, found[1].reshape(values.shape))
 
-    def _begin(self, streams: int, outputs: int, like: Tensor) -> FilterStreams:
+    def _begin(self, streams: int, outputs: int, like: Tensor) -> Streams:
+        begun, angles = self._filters(streams, outputs, like), self._angles(len(like))
+        if not angles:
+            return begun
+        return TurningStreams(begun, angles, like.new_full((streams, len(like)), math.nan))
+
+    def _angles(self, dim: int) -> tuple[int, ...]:
+        """Return the checked periodic coordinates."""
+        if not set(self.periodic) <= set(range(-dim, dim)):
+            raise fail(_NAME, "periodic", f"must be coordinates of {dim}", list(self.periodic))
+        return tuple(sorted({index % dim for index in self.periodic}))
+
+    def _filters(self, streams: int, outputs: int, like: Tensor) -> FilterStreams:
         dim, dtype, toward = len(like), like.dtype, self._directions(len(like))
         robust = math.inf if self.robust is None else positive_real(_NAME, "robust", self.robust)
         scaling, found = flag(_NAME, "scaling", self.scaling), self._tuning
@@ -225,9 +245,14 @@ class StaFRegressor(StreamEstimator):
         return self
 
     def _extra_state(self) -> dict[str, Any]:
-        return {} if self._tuning is None else {"tuning": self._tuning._asdict()}
+        extra: dict[str, Any] = {} if self._tuning is None else {"tuning": self._tuning._asdict()}
+        return extra | ({"periodic": [*self.periodic]} if len(self.periodic) else {})
 
     def _take_extra(self, state: dict[str, Any]) -> None:
+        if [*state.get("periodic", ())] != [*self.periodic]:
+            told = f"it has periodic={[*state.get('periodic', ())]}, this one {[*self.periodic]}"
+            rule = "must be of a regressor with the same arguments"
+            raise ValueError(f"`{_NAME}.load_state_dict(state=...)` {rule}: {told}.")
         self._tuning = Tuning(**state["tuning"]) if "tuning" in state else None
 
 

@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from ...numerics.checks import fail, positive_real
+from ...numerics.rows import chosen
 from ...systems.two_state_tracking import TwoStateTracking, feedforward, parametric_drift, regressor
 from ..critic.actor_critic import ActorCritic
 from ..critic.bellman import BellmanTerms
 from ..critic.laws import Weights
 from ..loop.controller import Controller, Policy
-from ..planning.ddp import chosen
 from ..problem.cost import matvec
 from .history_stack import ConcurrentLearning, Identified
 from .least_squares import Estimate, LeastSquares

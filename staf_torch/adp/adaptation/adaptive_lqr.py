@@ -10,8 +10,8 @@ from torch import Tensor
 
 from ...numerics.checks import fail, non_negative, positive_real, real
 from ...numerics.riccati import product
+from ...numerics.rows import chosen
 from ..loop.controller import LQR, Controller, Policy
-from ..planning.ddp import chosen
 from ..policies.rollout import RolloutPolicy, fitted_slope
 from ..problem.cost import Cost, matvec, quadratic
 from ..problem.rules import regulated

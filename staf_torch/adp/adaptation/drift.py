@@ -14,9 +14,9 @@ from ...numerics.checks import fail, non_negative, positive_real, real
 from ...numerics.linalg import row_jacobian
 from ...numerics.pivoted_cholesky import newton_basis
 from ...numerics.riccati import measured, product
+from ...numerics.rows import chosen
 from ...systems import ControlAffineSystem
 from ..loop.controller import LQR, Controller, Policy
-from ..planning.ddp import chosen
 from ..problem.cost import Cost, matvec, quadratic
 from ..problem.rules import regulated
 from .parametric import ParametricPlant

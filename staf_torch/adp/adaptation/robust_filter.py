@@ -11,8 +11,8 @@ from torch import Tensor
 
 from ...lanes.tree import flatten, unflatten
 from ...numerics.checks import fail, positive_real, vector
+from ...numerics.rows import chosen
 from ..loop.controller import Carried, Controller
-from ..planning.ddp import chosen
 from ..safety.conditions import Constraint, listed
 from ..safety.quadratic_program import nearest_admissible
 from ..safety.safety_filter import INFEASIBLE, SafetyFilter

@@ -7,6 +7,7 @@ from typing import NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
+from ...numerics.rows import chosen as chosen
 from ..problem.sampled import SampledProblem
 
 _LENGTHS = (2, 4, 7, 12, 20, 30)  # periods for which a corner of the bounds is held before the feedback
@@ -119,16 +120,6 @@ Some = TypeVar("Some", bound=tuple[Tensor, ...])
 def rows_of(parts: Some, index: Tensor) -> Some:
     """Some of the rows of a named tuple."""
     return type(parts)(*(part[index] for part in parts))
-
-
-def chosen(rows: Tensor, new: Some, old: Some) -> Some:
-    """The tensors of ``new`` in ``rows`` (B,), those of ``old`` in the others."""
-
-    def pick(a: Tensor, b: Tensor) -> Tensor:
-        return torch.where(rows.reshape(-1, *[1] * (a.dim() - 1)), a, b)
-
-    picked = map(pick, new, old)
-    return type(new)(*picked) if hasattr(new, "_fields") else type(new)(picked)
 
 
 def held_controls(problem: SampledProblem, steps: int) -> tuple[Tensor, Tensor]:
