@@ -181,3 +181,34 @@ def fewest_steps(errors: Callable[[int], Tensor], tolerance: float, most: int) -
 def stalls(error: float, last: float) -> bool:
     """Return whether twice the steps were of no use, because of rounding or corners of the rate."""
     return error <= _SMALL and error * _NEAR > last
+
+
+class Needed(NamedTuple):
+    """What rows need."""
+
+    factor: Tensor  # (R,) int64, times the steps
+    error: Tensor  # (R,) float64, that is left with them
+
+
+def needed_steps(
+    errors: Callable[[Tensor, int], Tensor], most: Tensor, tolerance: float, enough: float
+) -> Needed:
+    """Return how many times more steps every row needs, by doubling: nothing of another row is looked at.
+
+    Args:
+        errors: of rows (R',) int64 with so many times the steps, (R',).
+        most: times the steps, a row, (R,) int64.
+        tolerance: of the errors.
+        enough: error that is left as it is without more steps.
+    """
+    count = len(most)
+    factor, error = torch.ones(count, dtype=torch.int64), torch.full((count,), math.inf, dtype=torch.float64)
+    rows, last, times = torch.arange(count), error.clone(), 1
+    while len(rows):
+        now = errors(rows, times).double().cpu()
+        factor[rows], error[rows] = times, now
+        pairs = zip(now.tolist(), last.tolist(), strict=True)
+        stalled = torch.tensor([stalls(one, before) for one, before in pairs], dtype=torch.bool)
+        further = (now > (enough if times == 1 else tolerance)) & ~stalled & (2 * times <= most[rows])
+        rows, last, times = rows[further], now[further], 2 * times
+    return Needed(factor, error)

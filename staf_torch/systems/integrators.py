@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import logging
+import math
 from collections.abc import Iterator
 
 import torch
 from torch import Tensor
 
-from ..lanes import Program, shared_program
+from ..lanes import Program, repeat, shared_program
 from ..lanes.compiled_methods import undecided, worth
 from ..lanes.loop_program import LoopProgram
 from ..lanes.tree import Tree
 from ..numerics.checks import integer, positive_real, trailing
-from ..numerics.runge_kutta import runge_kutta_step
+from ..numerics.exponential_step import needed_steps
+from ..numerics.runge_kutta import runge_kutta_mean, runge_kutta_stages
 from .base import ControlAffineSystem
 
+_log = logging.getLogger(__name__)
+_TOLERANCE, _BENT, _TRIED, _MOST = 1e-6, 3e-3, 16, 1024  # as of loops: `adp.simulate`
 _PAYS = 10_000  # steps of a small batch in plain torch (some .1 ms each) that take as long as to compile
 
 
@@ -23,8 +28,10 @@ def trajectory(
 ) -> Iterator[Tensor]:
     """x(0), x(dt), ..., x(steps dt) without control, in pieces of at most ``chunk`` times.
 
-    The exact flow where the system has one, else Runge-Kutta steps of length dt. A trajectory that
-    escapes to infinity is non-finite from there on; the others do not notice.
+    The exact flow where the system has one, else Runge-Kutta steps of length dt; a trajectory whose rate is
+    too fast for that takes as many a dt as leave an error of 1e-6 of its state, and where they are too many
+    the log has a warning. A trajectory that escapes to infinity is non-finite from there on; the others do
+    not notice.
 
     Example:
         >>> x0 = torch.tensor([[1.0, 0.0]]).double()
@@ -52,16 +59,7 @@ def trajectory(
     size = total if chunk is None else integer("trajectory", "chunk", chunk, least=1)
     flow = getattr(system, "flow", None)  # a user's module need not have one
 
-    def step(x: Tensor, now: Tree, row: Tree) -> tuple[Tensor, Tensor]:
-        return runge_kutta_step(lambda at: _drift(system, at), x, dt), x  # the state before every step
-
-    def compiled() -> Program:
-        return shared_program("a trajectory", step, system, dt)
-
-    pays, x = worth(total * (1 + len(x0) / 200) >= _PAYS), x0
-    program: Program | LoopProgram = compiled() if pays else Program(step, name="a trajectory", compile=False)
-    if isinstance(program, Program) and not pays and undecided():
-        program = LoopProgram(program, compiled, total)
+    program, none, x = _stepped(system, dt, 1, total, len(x0)), torch.zeros_like(x0[..., 0]), x0
     for start in range(0, total, size):
         stop = min(start + size, total)
         time = torch.arange(start, stop, dtype=torch.float64) * dt
@@ -69,8 +67,86 @@ def trajectory(
         if exact is not None:
             yield exact
             continue
-        x, piece = program(x, steps=stop - start)
+        (after, bent, reach), piece = program((x, none, none), steps=stop - start)
+        strained = ~(bent <= _BENT * reach) & torch.isfinite(reach)
+        if bool(strained.any()):
+            after, piece = _refined(system, dt, x, after, piece, strained.nonzero().squeeze(1))
+        x = after
         yield piece
+
+
+Tracked = tuple[Tensor, Tensor, Tensor]
+"""x (B, n), how much the rate bent within a step so far (B,), the largest coordinate so far (B,)."""
+
+
+def _stepped(
+    system: ControlAffineSystem, dt: float, count: int, times: int, rows: int
+) -> Program | LoopProgram:
+    """Steps of dt in so many Runge-Kutta steps, which record the state before every one."""
+
+    def step(now: Tracked, given: Tree, row: Tree) -> tuple[Tracked, Tensor]:
+        x, bent, reach = now
+        after, more = _advanced(system, x, dt, count)
+        bent = torch.where(more <= bent, bent, more)
+        return (after, bent, torch.maximum(reach, x.abs().amax(-1))), x
+
+    def compiled() -> Program:
+        return shared_program("a trajectory", step, system, dt, count)
+
+    if worth(count * times * (1 + rows / 200) >= _PAYS):
+        return compiled()
+    plain = Program(step, name="a trajectory", compile=False)
+    return LoopProgram(plain, compiled, times) if undecided() else plain
+
+
+def _advanced(system: ControlAffineSystem, x: Tensor, dt: float, count: int) -> tuple[Tensor, Tensor]:
+    """x after dt, and how much the rate bent, h |k_3 - k_2|: (..., n) -> (..., n), (...)."""
+    h = dt / count
+
+    def substep(now: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+        _, slopes = runge_kutta_stages(lambda at, share: _drift(system, at), now[0], h)
+        bent = h * (slopes[2] - slopes[1]).abs().amax(-1)
+        return now[0] + runge_kutta_mean(slopes, h), torch.where(bent <= now[1], now[1], bent)
+
+    found: tuple[Tensor, Tensor] = repeat(count, substep, (x, torch.zeros_like(x[..., 0])))
+    return found
+
+
+def _refined(
+    system: ControlAffineSystem, dt: float, x: Tensor, after: Tensor, piece: Tensor, rows: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return the end and the states of a piece in which these rows (R,) took the steps that they need."""
+    states = piece[rows]
+    bent = _advanced(system, states, dt, 1)[1].nan_to_num(math.inf, math.inf)
+    bent = torch.where(torch.isfinite(states).all(-1), bent, -1.0)
+    at = bent.topk(min(_TRIED, bent.shape[1]), dim=1).indices.unsqueeze(-1)
+    tried = states.gather(1, at.expand(-1, -1, x.shape[-1]))
+    known = torch.isfinite(tried).all(-1)
+
+    def errors(some: Tensor, times: int) -> Tensor:
+        now, better = (_advanced(system, tried[some], dt, k * times)[0] for k in (1, 2))
+        size = torch.maximum(tried[some].abs(), better.abs().nan_to_num(0.0, 0.0)).amax(-1)
+        wrong = torch.where(known[some], (now - better).abs().amax(-1), 0.0).amax(1)
+        return (wrong / torch.where(known[some], size, 0.0).amax(1)).nan_to_num(math.inf, math.inf)
+
+    most = torch.full((len(rows),), _MOST)
+    found = needed_steps(errors, most, _TOLERANCE, 10 * _TOLERANCE)
+    for factor in found.factor.unique().tolist():
+        chosen = rows[(found.factor == factor).to(rows.device)]
+        if factor > 1:
+            begun = x[chosen], torch.zeros_like(x[chosen, 0]), torch.zeros_like(x[chosen, 0])
+            times = piece.shape[1]
+            (end, _, _), again = _stepped(system, dt, factor, times, len(chosen))(begun, steps=times)
+            after, piece = after.index_copy(0, chosen, end), piece.index_copy(0, chosen, again)
+    wrong = found.error > 10 * _TOLERANCE
+    if bool(wrong.any()):
+        _log.warning(
+            "a trajectory of %s in steps of %.4g s is wrong by more than %.0e of its state a step in %d "
+            "rows, by %.2g in row %d: its rate is too fast for this dt, or has corners.",
+            *(type(system).__name__, dt, 10 * _TOLERANCE, int(wrong.sum()), float(found.error.max())),
+            int(rows[int(found.error.argmax())]),
+        )
+    return after, piece
 
 
 def simulate(system: ControlAffineSystem, x0: Tensor, *, dt: float, steps: int) -> Tensor:

@@ -1,7 +1,7 @@
 """Accuracy of a simulated plant: which rows its integration steps were too long for, and how many they need.
 
 A loop records how much the rate bends within a step, which costs no call of the plant. Where that is much,
-the holds with the largest moves are repeated with twice the steps, and so on: a row's own number of steps
+the holds in which it bent most are repeated with twice the steps, and so on: a row's own number of steps
 follows, from nothing but what the row itself did.
 """
 
@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import logging
 import math
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ...numerics.exponential_step import stalls
+from ...numerics.exponential_step import Needed, needed_steps
 from ..problem.held_plant import GRACE, TOLERANCE, Holding
 
 _log = logging.getLogger(__name__)
@@ -22,13 +21,6 @@ BENT = 3e-3  # of the state: more bending is looked at; of a mode (h / tau)^3 / 
 _TRIED = 16  # holds of a row
 _MOST, _MOST_FROZEN = 1024, 64  # times the steps; of a row that left the finite numbers
 _TOGETHER = 1 << 16  # holds that are repeated at once
-
-
-class Needed(NamedTuple):
-    """What a row needs."""
-
-    factor: Tensor  # (R,) int64, times the steps
-    error: Tensor  # (R,) that is left with them, relative
 
 
 @torch.no_grad()
@@ -42,32 +34,15 @@ def needed(holding: Holding, x: Tensor, u: Tensor, frozen: Tensor, most: int = _
         frozen: (R,) bool: rows that left the finite numbers.
         most: steps of a hold.
     """
-    rows = max(1, _TOGETHER // x.shape[1])
-    parts = [
-        _needed(holding, *part, most) for part in zip(*(t.split(rows) for t in (x, u, frozen)), strict=True)
-    ]
-    return Needed(*(torch.cat(column) for column in zip(*parts, strict=True)))
-
-
-def _needed(holding: Holding, x: Tensor, u: Tensor, frozen: Tensor, limit: int) -> Needed:
-    count = len(x)
-    factor, error = torch.ones(count, dtype=torch.int64), torch.full((count,), math.inf, dtype=torch.float64)
-    rows, last, times = torch.arange(count), torch.full((count,), math.inf, dtype=torch.float64), 1
     known = torch.isfinite(u).all(-1) & torch.isfinite(x).all(-1)
-    while len(rows):
-        at, held = x[rows], u[rows].nan_to_num(0.0)
-        now = _errors(holding if times == 1 else holding.finer(times), at, held, known[rows])
-        factor[rows], error[rows] = times, now
-        pairs = zip(now.tolist(), last.tolist(), strict=True)
-        stalled = torch.tensor([stalls(one, before) for one, before in pairs], dtype=torch.bool)
-        most = torch.where(frozen[rows].cpu(), min(limit, _MOST_FROZEN), limit)
-        further = (
-            (now > (GRACE if times == 1 else 1.0) * TOLERANCE)
-            & ~stalled
-            & (2 * times * holding.steps <= most)
-        )
-        rows, last, times = rows[further], now[further], 2 * times
-    return Needed(factor, error)
+    limit = torch.where(frozen.cpu(), min(most, _MOST_FROZEN), most) // holding.steps
+
+    def errors(rows: Tensor, times: int) -> Tensor:
+        finer = holding if times == 1 else holding.finer(times)
+        some = rows.split(max(1, _TOGETHER // x.shape[1]))
+        return torch.cat([_errors(finer, x[part], u[part].nan_to_num(0.0), known[part]) for part in some])
+
+    return needed_steps(errors, limit, TOLERANCE, GRACE * TOLERANCE)
 
 
 def _errors(holding: Holding, x: Tensor, u: Tensor, known: Tensor) -> Tensor:
@@ -80,10 +55,14 @@ def _errors(holding: Holding, x: Tensor, u: Tensor, known: Tensor) -> Tensor:
     return worst
 
 
-def largest_moves(state: Tensor, control: Tensor, rest: Tensor, frozen: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the holds of every row in which it moved most, the first one, and where it froze.
+@torch.no_grad()
+def hardest(
+    holding: Holding, state: Tensor, control: Tensor, rest: Tensor, frozen: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return the holds of every row in which the rate bends most, the first one, and where it froze.
 
     Args:
+        holding: as it was.
         state: (R, T, n).
         control: (R, T, m), NaN where none was held.
         rest: u that holds the set-point, (m,), for a row that froze in its first hold.
@@ -93,10 +72,12 @@ def largest_moves(state: Tensor, control: Tensor, rest: Tensor, frozen: Tensor) 
         (R, K, n), (R, K, m).
     """
     held = torch.isfinite(control[:, :-1]).all(-1)
-    moved = (state[:, 1:] - state[:, :-1]).abs().amax(-1)
-    moved[:, 0] = torch.inf
-    moved = torch.where(held, moved, -1.0)
-    at = moved.topk(min(_TRIED, moved.shape[1]), dim=1).indices.unsqueeze(-1)
+    rows, inputs = state[:, :-1].flatten(0, 1), control[:, :-1].flatten(0, 1).nan_to_num(0.0)
+    pieces = zip(rows.split(_TOGETHER), inputs.split(_TOGETHER), strict=True)
+    bent = torch.cat([holding.watched(x, u)[2] for x, u in pieces]).view(held.shape)
+    bent = torch.where(held, bent.nan_to_num(math.inf, math.inf), -1.0)
+    bent[:, 0] = math.inf
+    at = bent.topk(min(_TRIED, bent.shape[1]), dim=1).indices.unsqueeze(-1)
     x = state.gather(1, at.expand(-1, -1, state.shape[-1]))
     u = control.gather(1, at.expand(-1, -1, control.shape[-1]))
     last = (held.sum(1) - 1).clamp(min=0)[:, None, None].expand(-1, -1, control.shape[-1])

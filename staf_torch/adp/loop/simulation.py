@@ -20,7 +20,7 @@ from ...systems import ControlAffineSystem, Plant
 from ..problem.cost import Cost
 from ..problem.held_plant import RESOLVED, Holding, Substeps, fewest_and_most
 from ..problem.rules import warn_if_restless, warn_if_unstable
-from .accuracy import BENT, largest_moves, needed, warn_of_errors
+from .accuracy import BENT, hardest, needed, warn_of_errors
 from .controller import Carried, Controller, Feedback, Policy
 from .step import ClosedLoop, LoopState, program, record, row_numbers
 
@@ -247,7 +247,7 @@ class _Run:
         ``again``; warn of those that are wrong by more than a little."""
         rest, at = loop.system.resting_input(), rows.nonzero().squeeze(1)
         frozen = result.diverged[at]
-        moves = largest_moves(result.state[at], result.control[at], rest, frozen)
+        moves = hardest(loop.holding, result.state[at], result.control[at], rest, frozen)
         found = needed(loop.holding, *moves, frozen)
         if not again:
             one = needed(loop.holding, *moves, torch.ones_like(frozen), most=1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from typing import Any
 
@@ -15,6 +16,7 @@ from ...lanes import compiled, each, repeat
 from ...lanes.call import PlannedCall
 from ...lanes.compiled_methods import Rows
 from ...numerics.checks import fail, integer, positive_real
+from ...numerics.exponential_step import stalls
 from ...systems import Barrier, ControlAffineSystem
 from ..loop.controller import LQR, Policy, Value
 from ..problem.cost import Cost
@@ -22,6 +24,10 @@ from ..problem.held_plant import runge_kutta_loop
 
 _NAME = "a rollout policy"
 _KEPT = 64  # forms of one state that are remembered
+_log = logging.getLogger(__name__)
+_STEPS, _MOST = 10, 4096  # over the horizon: usually, and at most
+_ERROR, _WRONG, _LEAST = 1e-2, 3e-2, 1e-12  # of costs: more steps are tried, a warning, next to nothing
+_SAMPLES = 16
 
 
 class RolloutPolicy(nn.Module):
@@ -54,7 +60,8 @@ class RolloutPolicy(nn.Module):
         base: the base policy, (..., n) -> (..., m).
         terminal: V_T, (..., n) -> (...): the Riccati value for an LQR base.
         horizon: s, positive.
-        steps: Runge-Kutta steps over the horizon, at least 1.
+        steps: Runge-Kutta steps over the horizon, at least 1; None for 10, or as many as find the costs of
+            the base to 1 %. Fewer are a warning in the log.
         depth: how many times the policy is improved, at least 1.
         period: least time for which a closed loop holds the control, s, positive; None where any will do.
 
@@ -74,7 +81,7 @@ class RolloutPolicy(nn.Module):
         terminal: Value,
         *,
         horizon: float = 0.5,
-        steps: int = 10,
+        steps: int | None = None,
         depth: int = 1,
         period: float | None = None,
     ) -> None:
@@ -87,13 +94,16 @@ class RolloutPolicy(nn.Module):
             raise fail("RolloutPolicy", "basis", f"must have the plant's {model.dim} states", basis.dim)
         self.basis, self.model, self.cost, self.terminal = basis, model, cost.around(model), terminal
         self.horizon = positive_real("RolloutPolicy", "horizon", horizon)
-        self.steps = integer("RolloutPolicy", "steps", steps, least=1)
+        self.steps = integer("RolloutPolicy", "steps", _STEPS if steps is None else steps, least=1)
         self.depth = integer("RolloutPolicy", "depth", depth, least=1)
         self.period = None if period is None else positive_real("RolloutPolicy", "period", period)
         self.base: Policy = base
         if depth > 1:
             settings = {"horizon": horizon, "steps": steps, "depth": depth - 1}
             self.base = RolloutPolicy(basis, model, cost, base, terminal, **settings)  # type: ignore[arg-type]
+            self.steps = self.base.steps
+        else:
+            self._check_steps(chosen=steps is None)
 
     @classmethod
     def of_lqr(
@@ -104,7 +114,7 @@ class RolloutPolicy(nn.Module):
         centers: int | None = None,
         radius: float | Radius = 0.1,
         horizon: float = 0.5,
-        steps: int = 10,
+        steps: int | None = None,
         depth: int = 1,
         period: float | None = None,
         kernel: Kernel | None = None,
@@ -137,6 +147,31 @@ class RolloutPolicy(nn.Module):
         basis = StaFBasis(kernel, StateFollowingCenters(directions, radius))
         end = lqr.value if cost.ending is None else lqr.cost.terminal
         return cls(basis, system, cost, lqr, end, horizon=horizon, steps=steps, depth=depth, period=period)
+
+    @torch.no_grad()
+    def _check_steps(self, chosen: bool) -> None:
+        """Find out by step doubling whether the steps are enough, and take more where they may be chosen."""
+        rest = torch.zeros(self.basis.dim) if self.cost.target is None else self.cost.target
+        generator = torch.Generator().manual_seed(0)
+        away = 2 * torch.rand(_SAMPLES, self.basis.dim, dtype=torch.float64, generator=generator) - 1
+        x, error = rest.double() + self.model.spread * away, math.inf
+        now, first = self.rollout(x), self.steps
+        while True:
+            self.steps *= 2
+            finer = self.rollout(x)
+            errors = ((now - finer).abs() / (finer.abs() + _LEAST)).nan_to_num(math.inf, math.inf)
+            last, error = error, float(errors.quantile(0.8, interpolation="lower"))
+            enough = error <= _ERROR or stalls(error, last) or not chosen or 2 * self.steps > _MOST
+            if enough:
+                break
+            now = finer
+        self.steps = self.steps // 2 if chosen else first
+        if error > _WRONG:
+            _log.warning(
+                "RolloutPolicy: with %d integration steps over the horizon of %.3g s the costs of the base "
+                "are wrong by %.2g; they need more `steps`, or a shorter horizon.",
+                *(self.steps, self.horizon, error),
+            )
 
     @compiled(_NAME, by=lambda policy: _TwoPrograms(policy))
     def forward(self, x: Tensor) -> Tensor:  # type: ignore[override]

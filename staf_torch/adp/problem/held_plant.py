@@ -25,7 +25,6 @@ from ...numerics.exponential_step import (
 from ...systems import Clocked, Plant, StepPlant
 from .cost import Cost
 from .held_linear import periods
-from .tracking_cost import TrackingCost
 
 _log = logging.getLogger(__name__)
 TOLERANCE = 1e-6  # error of a hold, relative to the state
@@ -102,6 +101,7 @@ class Holding:
         self.dt = positive_real(call, "dt", dt)
         self.least, self.steps = fewest_and_most(call, 1 if substeps is None else substeps)
         self.table: ExponentialStep | None = None
+        self.curvature: Tensor | None = None  # of the cost, with a table
         self.discount = 0.0 if cost is None else cost.discount
         self.error: float | None = None
         if plant.period is not None:
@@ -232,16 +232,15 @@ class Holding:
     def _exponential(self, x: Tensor, u: Tensor, h: float, watch: bool) -> tuple[Tensor, ...]:
         plant, cost, table, none = self.plant, self.cost, self.table, torch.zeros_like(x[..., 0])
         assert table is not None
-        begun = torch.zeros_like(x) if table.paid is None or cost is None else cost.deviation(x)
-        curvature = None if cost is None or table.paid is None else cost.state_curvature().to(x)
-        plain = cost is None or (table.paid is not None and cost.output is None and not cost.periodic)
+        begun = torch.zeros_like(x) if cost is None else cost.deviation(x)
+        still = cost is None or _quadratic(cost)
 
         def field(away: Tensor) -> tuple[Tensor, Tensor]:
             at = x + away
-            if cost is None or plain:
+            if cost is None or still:
                 return plant.motion(at, u), none
-            rate = cost.state_rate(at)
-            return plant.motion(at, u), rate if curvature is None else rate - _square(curvature, begun + away)
+            assert self.curvature is not None
+            return plant.motion(at, u), cost.state_rate(at) - _square(self.curvature.to(x), begun + away)
 
         moved, rests, rates = exponential_stages(table, field, x)
         paid = none
@@ -249,18 +248,16 @@ class Holding:
             shares = _shares(h, self.discount, x)[2]
             whole = h if not self.discount else -math.expm1(-self.discount * h) / self.discount
             paid = whole * cost.input_rate(u)
-            if not plain:
+            if not still:  # what the rate differs from the quadratic form around the start, by Simpson's rule
                 paid = paid + (shares.reshape(-1, *[1] * none.dim()) * rates).sum(0)
-            if table.paid is not None:
-                seen = torch.cat((begun, rests[0], 0.5 * (rests[1] + rests[2]), rests[3]), dim=-1)
-                paid = paid + _square(table.paid.to(x), seen)
+            assert table.paid is not None
+            seen = torch.cat((begun, rests[0], 0.5 * (rests[1] + rests[2]), rests[3]), dim=-1)
+            paid = paid + _square(table.paid.to(x), seen)
         after = plant.displaced(x, moved)
         return (after, paid, h * (rests[2] - rests[1]).abs().amax(-1)) if watch else (after, paid)
 
     def _table(self, linear: Tensor, steps: int) -> ExponentialStep:
-        cost = self.cost
-        curvature = None if cost is None or isinstance(cost, TrackingCost) else cost.state_curvature()
-        return exponential_step(linear, self.dt / steps, curvature, 0.0 if cost is None else cost.discount)
+        return exponential_step(linear, self.dt / steps, self.curvature, self.discount)
 
     def _choose(self, exponential: bool) -> None:
         """Choose the kind of the steps and their number."""
@@ -276,6 +273,8 @@ class Holding:
         if not slow or usual > GRACE * TOLERANCE or found.error > _OUTSIDE * TOLERANCE:
             if not (exponential and _adds(self.plant)):
                 linear = None
+            elif self.cost is not None:
+                self.curvature = self.cost.state_curvature()
             dear = StepCount(_MOST, math.inf)
             if linear is not None:
                 dear = fewest_steps(errors(linear), TOLERANCE, _MOST)
@@ -366,6 +365,13 @@ def _adds(plant: Plant) -> bool:
     """Return whether a step of the motion is added to the state."""
     kind = type(plant)
     return kind.displaced is Plant.displaced and kind.velocity is Plant.velocity
+
+
+def _quadratic(cost: Cost) -> bool:
+    """Return whether the state's rate is the quadratic form of the deviation, without turns."""
+    kind = type(cost)
+    own = kind.state_rate is not Cost.state_rate or kind.deviation is not Cost.deviation
+    return not (own or cost.output is not None or cost.periodic)
 
 
 def _square(matrix: Tensor, x: Tensor) -> Tensor:
