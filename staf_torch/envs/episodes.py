@@ -183,7 +183,7 @@ class Episodes:
             raise fail("Episodes.step", "u", f"must have the shape {wanted}", tuple(u.shape))
         alive = torch.ones_like(self.age, dtype=torch.bool)
         none = self.state.new_zeros(len(u))
-        before = LoopState(self.state, none, alive, self.age, none, none, u.to(self.state))
+        before = LoopState(self.state, none, alive, self.age, none, u.to(self.state))
         with torch.no_grad():
             after, _ = self.loop(before, self.state.new_zeros(len(u), 0, self.state.shape[1]))
         self.state = after.x

@@ -15,6 +15,7 @@ from ...lanes import Program
 from ...lanes.compiled_methods import undecided, worth
 from ...lanes.loop_program import LoopProgram
 from ...lanes.tree import flatten, unflatten
+from ...numerics.angles import wrap
 from ...numerics.checks import choice, copied, fail, integer, positive_real, trailing
 from ...systems import ControlAffineSystem, Plant
 from ..problem.cost import Cost
@@ -27,6 +28,7 @@ from .step import ClosedLoop, LoopState, program, record, row_numbers
 _log = logging.getLogger(__name__)
 _DRAWN_AHEAD = 1024  # steps whose random numbers are drawn at once
 _NUMBERS = 1 << 24  # at most, of all rows together
+_SEEN = 32  # times at which the size of a row's states is looked at
 _EULER = 64  # rows of the published integrator that are checked
 _DT = 0.001  # s, where neither controller nor plant has a period
 _PAYS = (
@@ -201,7 +203,9 @@ def simulate(
     whole = _Run(x0, steps, every, _seeds(seed, len(x0)), compile, progress)
     with torch.no_grad():
         result, last = whole.of(loop)
-        strained = ~(last.bent <= BENT * last.reach) & torch.isfinite(last.reach)
+        seen = result.state[:, :: max(1, result.state.shape[1] // _SEEN)]
+        reach = wrap(seen, system.periodic).abs().amax(-1).amax(-1)
+        strained = ~(last.bent <= BENT * reach) & torch.isfinite(reach)
         if integrator == "euler" and system.period is None:
             strained[:_EULER] = True
         if not bool(strained.any()):
@@ -265,18 +269,20 @@ class _Run:
 
     def _replaced(self, result: LoopResult, loop: ClosedLoop, rows: Tensor) -> LoopResult:
         """Return the result with these rows (R,) of another loop."""
-        alone = not row_numbers(loop)  # else a controller has numbers of all rows
-        some = dataclasses.replace(self, progress=None)
-        if alone:
-            seeds = [self.seeds[row] for row in rows.tolist()]
-            some = dataclasses.replace(some, x0=self.x0[rows], seeds=seeds)
-        other, _ = some.of(loop)
+        whole = dataclasses.replace(self, progress=None)
+        some = dataclasses.replace(whole, x0=self.x0[rows], seeds=[self.seeds[row] for row in rows.tolist()])
+        alone = not row_numbers(loop)
+        try:
+            other, _ = (some if alone else whole).of(loop)
+        except (RuntimeError, ValueError):  # the controller has numbers of all rows
+            alone = False
+            other, _ = whole.of(loop)
         fields = [field.name for field in dataclasses.fields(result) if field.name != "time"]
         kept, structure = flatten([getattr(result, name) for name in fields])
         new = flatten([getattr(other, name) for name in fields])[0]
         pairs = zip(kept, new, strict=True)
-        whole = [old.index_copy(0, rows, fresh if alone else fresh[rows]) for old, fresh in pairs]
-        return LoopResult(result.time, *unflatten(structure, iter(whole)))
+        mixed = [old.index_copy(0, rows, fresh if alone else fresh[rows]) for old, fresh in pairs]
+        return LoopResult(result.time, *unflatten(structure, iter(mixed)))
 
 
 def _run(

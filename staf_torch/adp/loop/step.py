@@ -28,7 +28,6 @@ class LoopState(NamedTuple):
     alive: Tensor  # (B,) bool; a row that became non-finite keeps its last finite values
     lived: Tensor  # (B,) steps taken alive
     bent: Tensor  # (B,) of `Holding.watched`, the largest so far
-    reach: Tensor  # (B,) the largest coordinate of a state so far
     carried: Carried
 
 
@@ -101,7 +100,7 @@ class ClosedLoop(nn.Module):
                     f"`{type(self.controller).__name__}.init` must return tensors (B, ...), here with "
                     f"B = {x0.shape[0]}; got one of {tuple(part.shape)}."
                 )
-        return LoopState(x0, zeros, alive, *(zeros.clone() for _ in range(3)), carried)
+        return LoopState(x0, zeros, alive, zeros.clone(), zeros.clone(), carried)
 
     def forward(self, state: LoopState, uniform: Tensor) -> tuple[LoopState, Tensor]:
         """The state after dt seconds, and the control held until then, (B, m)."""
@@ -131,9 +130,8 @@ class ClosedLoop(nn.Module):
         if self.cost.discount:
             spent = spent * torch.exp(-self.cost.discount * self.dt * state.lived)
         cost = state.cost + torch.where(alive, spent, 0.0)
-        bent = torch.where(state.alive & ~(bent <= state.bent), bent, state.bent)  # also what is not a number
-        reach = torch.maximum(state.reach, wrap(state.x, self.system.periodic).abs().amax(-1))
-        return LoopState(_where(alive, x, state.x), cost, alive, state.lived + alive, bent, reach, kept), u
+        bent = torch.maximum(bent, state.bent)  # of what is not a number: that
+        return LoopState(_where(alive, x, state.x), cost, alive, state.lived + alive, bent, kept), u
 
     def _advance(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The state after dt with u held, the cost until then, and how much the rate bends."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from helpers import tensor
@@ -132,3 +133,69 @@ def test_kalman_filters_of_a_stiff_plant_have_the_deviation_of_the_exact_step(ki
         p = f @ p @ f.mT + 0.02 * 0.01 * torch.eye(2).double()
         p = p - p[:, :1] @ p[:1] / (p[0, 0] + 1e-4)
     torch.testing.assert_close(belief.covariance[0], p, rtol=1e-8, atol=1e-12)
+
+
+def test_trajectories_without_control_take_the_steps_that_they_need(caplog: pytest.LogCaptureFixture) -> None:
+    plant, x0 = systems.Linear([[0.0, 1.0], [-1.0, -300.0]]), tensor([[1.0, 1.0], [0.0, 0.0]])
+
+    class Written(systems.ControlAffineSystem):
+        dim = 2
+
+        def drift(self, x: Tensor) -> Tensor:
+            return plant.drift(x)
+
+    times = 0.02 * torch.arange(6, dtype=torch.float64)
+    found = systems.simulate(Written(), x0, dt=0.02, steps=5)
+    torch.testing.assert_close(found, plant.flow(x0, times), rtol=0, atol=1e-6)
+    assert not caplog.text
+
+
+def test_a_path_and_a_stiff_plant_are_designed_and_simulated_alike() -> None:
+    plant = systems.Clocked(MOTOR)
+
+    def path(t: Tensor) -> Tensor:
+        return torch.stack((0.5 * t.sin(), 0.5 * t.cos()), dim=-1)
+
+    cost = adp.TrackingCost([1550.0, 15.5], 1 / 144, dim=2, inputs=1, path=path)
+    lqr, problem = adp.LQR(plant, cost, period=0.02), adp.SampledProblem.of(plant, cost, dt=0.02)
+    torch.testing.assert_close(problem.k, lqr.k, rtol=1e-5, atol=1e-6)
+    x = plant.at(AWAY)
+    run = adp.simulate(lqr, plant, cost, x, dt=0.02, steps=10, compile=False)
+    spent = torch.zeros(1).double()
+    for _ in range(10):
+        x, paid = problem.advance(x, lqr(x))
+        spent = spent + paid
+    torch.testing.assert_close(run.cost, spent, rtol=1e-6, atol=0)
+    torch.testing.assert_close(run.state[:, -1], x, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("library", ["numpy", "torch"])
+def test_a_rate_that_is_not_affine_in_the_control_may_be_stiff(library: str) -> None:
+    def rate(x: Any, u: Any) -> Any:
+        sin, stack = (np.sin, np.stack) if library == "numpy" else (torch.sin, torch.stack)
+        if library == "numpy" and isinstance(x, Tensor):
+            raise TypeError("NumPy alone")
+        return stack((x[:, 1], -300 * x[:, 1] - 5 * sin(x[:, 0]) + 300 * u[:, 0] + u[:, 0] ** 2), 1)
+
+    plant, cost = systems.RatePlant(rate, dim=2, inputs=1), adp.QuadraticCost(1.0, 0.1, dim=2, inputs=1)
+    lqr = adp.LQR(plant, cost, period=0.05)
+    run = adp.simulate(lqr, plant, cost, AWAY, dt=0.05, steps=5, compile=False)
+    fine = adp.simulate(lqr, plant, cost, AWAY, dt=0.05, steps=5, substeps=200, compile=False)
+    torch.testing.assert_close(run.cost, fine.cost, rtol=1e-5, atol=0)
+
+
+def test_single_precision_has_the_cost_of_double_precision() -> None:
+    lqr = adp.LQR(MOTOR, COST, period=0.02)
+    run = adp.simulate(lqr, MOTOR, COST, AWAY.float(), dt=0.02, steps=50, compile=False)
+    assert run.cost.dtype == torch.float32
+    torch.testing.assert_close(run.cost.double(), lqr.value(AWAY), rtol=1e-4, atol=0)
+
+
+def test_a_rollout_in_too_few_steps_is_a_warning_and_takes_more_by_itself(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    few = adp.RolloutPolicy.of_lqr(MOTOR, COST, steps=10)
+    assert few.steps == 10
+    assert "with 10 integration steps over the horizon" in caplog.text
+    assert adp.RolloutPolicy.of_lqr(MOTOR, COST).steps > 100
+    assert adp.RolloutPolicy.of_lqr(systems.Pendulum(), adp.QuadraticCost(1.0, 1.0, 2, 1)).steps == 10
