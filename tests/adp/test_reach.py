@@ -77,9 +77,9 @@ def test_where_the_lqr_regulates_the_box_the_policy_is_as_before(caplog: pytest.
         (systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]]), {"dt": 0.1, "low": -1.0, "high": 1.0}),
     ):
         local = adp.near_optimal(plant, cost, reach="local", **given)  # type: ignore[arg-type]
-        began = time.perf_counter()
+        began = time.thread_time()
         policy = adp.near_optimal(plant, cost, **given)  # type: ignore[arg-type]
-        assert time.perf_counter() - began < 3
+        assert time.thread_time() - began < 2
         assert policy.reach.way == "local"
         assert policy.reach.regulated == policy.reach.base == 1.0
         assert local.reach.regulated is None
