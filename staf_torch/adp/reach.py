@@ -60,7 +60,8 @@ def sample(cost: Cost, width: Tensor) -> Tensor:
 def arrived(cost: Cost, x: Tensor, x0: Tensor) -> Tensor:
     """Whether states (B, n) are within 1 % of where they began, (B,) bool."""
     left, began = cost.deviation(x).norm(dim=-1), cost.deviation(x0).norm(dim=-1)
-    return torch.isfinite(left) & (left <= REGULATED * began)
+    close: Tensor = torch.isfinite(left) & (left <= REGULATED * began)
+    return close
 
 
 def extended(

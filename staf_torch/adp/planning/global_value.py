@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -15,6 +16,7 @@ from ..problem.rules import check_endless, check_regulator
 from ..problem.sampled import SampledProblem
 from .trajectories import LocalModel, Reference, Trajectories, around, packed, resting, unpacked
 
+_log = logging.getLogger(__name__)
 _TOGETHER = 4096  # candidates rolled out at once
 _ROUND = 0.01  # share of the metric that counts every coordinate, also one of which no cost depends
 _REACH = 0.3  # of the region: a rollout that ends further from what it follows has lost it
@@ -119,6 +121,7 @@ class GlobalValue(nn.Module):
         self.candidates = min(integer("GlobalValue", "candidates", candidates, least=1), len(self.entries))
         self.register_buffer("frame", self._frame())  # F with F F' = G, (n, n)
         self.frame: Tensor
+        self._said = False  # that states are not covered
         self._judge = Program(self._judged, name="a global value", copies=1)
         self._ready()
 
@@ -147,10 +150,20 @@ class GlobalValue(nn.Module):
         """u: (..., n) -> (..., m)."""
         rows = x if x.dim() == 2 else x.reshape(-1, x.shape[-1])
         if len(rows) == 1:
-            cost, control, _ = self._followed(rows.expand(self.candidates + 1, -1), self.nearest(rows)[0])
-            u = control[int(cost.numpy().argmin())]
+            entries = self.nearest(rows)[0]
+            cost, control, covered = self._followed(rows.expand(self.candidates + 1, -1), entries)
+            best = int(cost.numpy().argmin())
+            u, known = control[best], covered[best]
         else:
-            u = self.choose(rows).control
+            found = self.choose(rows)
+            u, known = found.control, found.covered
+        if not self._said and not bool(known.all()):
+            self._said = True
+            _log.warning(
+                "GlobalValue: from %d of %d states no remembered plan leads to where it is known; the "
+                "control is that of the one that comes nearest, `value` is inf there. This is said once.",
+                *(int((~known).sum()), len(rows)),
+            )
         return u if x.dim() == 2 else u.reshape(*x.shape[:-1], u.shape[-1])
 
     def value(self, x: Tensor) -> Tensor:
