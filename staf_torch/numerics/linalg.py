@@ -200,8 +200,9 @@ def slope_of(values: Tensor, at: Tensor, *, create_graph: bool = False) -> Tenso
     """
     if not values.requires_grad:
         return torch.zeros_like(at)
-    kept = {"create_graph": True} if create_graph else {"retain_graph": True}
-    return torch.autograd.grad(values.sum(), at, materialize_grads=True, **kept)[0]
+    return torch.autograd.grad(
+        values.sum(), at, retain_graph=True, create_graph=create_graph, materialize_grads=True
+    )[0]
 
 
 def exponential(matrix: Tensor) -> Tensor:

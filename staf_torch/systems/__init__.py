@@ -10,6 +10,8 @@ from .base import Units as Units
 from .bounds import Bounds as Bounds
 from .cart_pole import CartPole as CartPole
 from .clocked import Clocked as Clocked
+from .equilibria import Equilibrium as Equilibrium
+from .equilibria import find_equilibrium as find_equilibrium
 from .integrators import simulate as simulate
 from .integrators import trajectory as trajectory
 from .linear import Linear as Linear

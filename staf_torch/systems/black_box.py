@@ -20,6 +20,7 @@ Slopes = Callable[[Any, Any], tuple[Any, Any]]
 """(x (n,), u (m,)) -> the derivatives with respect to x, (n, n), and u, (n, m), of NumPy arrays."""
 Numbers = np.ndarray[Any, np.dtype[np.float64]]
 _PROBES = 3  # rows that the function is tried with
+_PUSHES = (1.0, 10.0, 100.0, 1000.0)  # of the inputs' tries, one after the other, until one moves the plant
 _KINK = 0.05  # of the largest slope, by which the slopes of two step sizes may differ
 
 
@@ -27,7 +28,9 @@ class BlackBox:
     """A batched function of x and u, called with what it understands.
 
     It is tried once: with torch tensors that want derivatives, else with NumPy arrays. Only the first kind is
-    differentiated by autograd and compiled; the slopes of the other come from central differences.
+    differentiated by autograd and compiled; the slopes of the other come from central differences, as those
+    of a function of tensors whose result has no derivative (a network under `torch.no_grad`). Parameters of a
+    network count with the values that they have: no gradient reaches them.
 
     Args:
         call: name of the constructor and the argument, for messages: ``StepPlant(step=...)``.
@@ -40,7 +43,8 @@ class BlackBox:
         torch: whether the function is torch all the way through.
 
     Raises:
-        ValueError: if it raises, returns another shape or something not finite, or ignores u.
+        ValueError: if it raises, with what it says of tensors and of arrays; if it returns another shape or
+            something not finite, or ignores u.
     """
 
     def __init__(
@@ -49,6 +53,8 @@ class BlackBox:
         if not callable(function):
             raise ValueError(f"`{call}` must be a function of x (B, n) and u (B, m); got {function!r}.")
         self._call, self._function, self._slopes = call, function, slopes
+        self._said = ""  # by the function, of tensors
+        self._tensors = True  # whether it takes them
         self.torch = self._traces(x, u)
         self._try(x, u)
 
@@ -146,11 +152,16 @@ class BlackBox:
         try:
             with torch.enable_grad():
                 after = self._function(z[:, : len(x)], z[:, len(x) :])
-            return isinstance(after, Tensor) and after.requires_grad
-        except Exception:  # it is tried again with NumPy, whose complaint is the one to show
+            self._tensors = isinstance(after, Tensor)
+            return self._tensors and after.requires_grad
+        except Exception as error:  # it is tried again with NumPy; both complaints are shown
+            self._tensors, self._said = False, _shown(error)
             return False
 
     def _numpy(self, x: Tensor, u: Tensor) -> Tensor:
+        if self._tensors:
+            found: Tensor = self._function(x.detach(), u.detach())
+            return found
         after = self._function(x.detach().cpu().numpy(), u.detach().cpu().numpy())
         return torch.as_tensor(np.asarray(after, dtype=np.float64)).to(x)
 
@@ -158,16 +169,21 @@ class BlackBox:
         generator = torch.Generator().manual_seed(0)
         away = 0.1 * torch.randn(_PROBES, len(x) + 2 * len(u), dtype=torch.float64, generator=generator)
         states, inputs = x + away[:, : len(x)], u + away[:, len(x) : len(x) + len(u)]
-        try:
+
+        def pushed(size: float) -> tuple[tuple[Tensor, Tensor], Tensor]:
+            both = states.repeat(2, 1), torch.cat((inputs, inputs + size * away[:, -len(u) :]))
             with torch.no_grad():
-                both = states.repeat(2, 1), torch.cat((inputs, inputs + away[:, -len(u) :]))
-                after = self._function(*both) if self.torch else self._numpy(*both)
+                return both, self._function(*both) if self.torch else self._numpy(*both)
+
+        try:
+            both, after = pushed(1.0)
         except Exception as error:
-            said = str(error).splitlines()[0] if str(error) else ""
+            kind = "as torch tensors" if self._tensors else "as NumPy arrays"
+            said = f"; as torch tensors of float64 {self._said}" if self._said else ""
+            hint = " A network in float32 needs `.double()`." if "Float" in said else ""
             raise ValueError(
-                f"`{self._call}` raised {type(error).__name__} ({said}) at x and u of the shapes "
-                f"{tuple(states.shape)} and {tuple(inputs.shape)}, as torch tensors and as NumPy arrays. "
-                "It must map rows to rows."
+                f"`{self._call}` raised {_shown(error)} at x and u of the shapes {tuple(states.shape)} and "
+                f"{tuple(inputs.shape)}, {kind}{said}. It must map rows to rows.{hint}"
             ) from error
         if not isinstance(after, Tensor) or after.shape != both[0].shape:
             got = tuple(after.shape) if isinstance(after, Tensor) else type(after).__name__
@@ -177,7 +193,21 @@ class BlackBox:
             )
         if not bool(torch.isfinite(after).all()):
             raise ValueError(f"`{self._call}` returned values that are not finite near x = {x.tolist()}.")
-        first, second = after.chunk(2)
-        if torch.equal(first, second):
+        # What sticks is moved by a large input alone.
+        if all(_same(pushed, size) for size in _PUSHES):
             rule = "ignores u: another input changes nothing"
             raise ValueError(f"`{self._call}` {rule} near x = {x.tolist()}.")
+
+
+def _same(pushed: Callable[[float], tuple[Any, Tensor]], size: float) -> bool:
+    """Return whether the two halves of the rows, which differ in u, move alike."""
+    try:
+        first, second = pushed(size)[1].chunk(2)
+    except Exception:  # of a simulator that refuses a large input
+        return True
+    return torch.equal(first.nan_to_num(), second.nan_to_num())
+
+
+def _shown(error: Exception) -> str:
+    """Kind and first line of an error."""
+    return f"{type(error).__name__} ({str(error).splitlines()[0] if str(error) else ''})"

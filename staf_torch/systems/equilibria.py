@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -23,20 +24,36 @@ def check_rest(plant: Plant, x: Tensor, u: Tensor) -> None:
         u: (m,).
 
     Raises:
-        ValueError: if the motion exceeds 1e-6 of the plant's rates there, with its value.
+        ValueError: if the motion exceeds 1e-6 of the plant's rates there, with its value and the nearest
+            equilibrium.
     """
     if _rests(plant, x, u):
         return
     moves = _motion(plant, x, u)
-    name = type(plant).__name__
+    name, nearest = type(plant).__name__, _nearest(plant, x, u)
     if not bool((x != 0).any() or (u != 0).any()) and hasattr(plant, "drift"):
         raise ValueError(
             f"`{name}.drift` must be 0 at the origin, the state to regulate to; got {moves.tolist()}. "
-            "Say where the plant rests by `equilibrium` and `resting_input`, or by a set-point of the cost."
+            "Say where the plant rests by `equilibrium` and `resting_input`, or by a set-point of the cost. "
+            f"{nearest}"
         )
     raise ValueError(
         f"{name} does not rest at the state {x.tolist()} under the input {u.tolist()}: it moves by "
-        f"{moves.tolist()}. Choose a set-point at which an admissible input holds it."
+        f"{moves.tolist()}. Choose a set-point at which an admissible input holds it. {nearest}"
+    )
+
+
+def _nearest(plant: Plant, x: Tensor, u: Tensor) -> str:
+    """A sentence on the nearest equilibrium, with numbers and the call that returns it."""
+    try:
+        rest = find_equilibrium(plant, x, u)
+    except ValueError:
+        return "None is near it."
+    away = float((rest.state - x).norm())
+    return (
+        f"The nearest one is {away:.3g} away, the state {rest.state.tolist()} under the input "
+        f"{rest.input.tolist()}: `rest = systems.find_equilibrium(plant, {x.tolist()})`, then "
+        "`target=rest.state, target_input=rest.input` of the cost."
     )
 
 
@@ -52,27 +69,53 @@ def resting_input_at(plant: Plant, x: Tensor, guess: Tensor | None = None) -> Te
     return _gauss_newton(lambda v: _motions(plant, x.expand(len(v), -1), v), u)
 
 
-def find_equilibrium(plant: Plant, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-    """A state and an input at which the plant rests, near a guess.
+class Equilibrium(NamedTuple):
+    """A state and an input that holds a plant there.
+
+    Example:
+        >>> systems.find_equilibrium(systems.Pendulum(), [0.0, 0.0]).input
+        tensor([0.], dtype=torch.float64)
+
+        Shown by `staf_torch/adp/README.md`.
+    """
+
+    state: Tensor  # (n,)
+    input: Tensor  # (m,)
+
+
+def find_equilibrium(
+    plant: Plant, x: Sequence[float] | Tensor, u: Sequence[float] | Tensor | None = None
+) -> Equilibrium:
+    """A state and an input at which the plant rests, near a guess: a set-point of a plant that was learnt,
+    which never rests exactly where it should.
 
     The input alone moves first, as far as that serves; then state and input together, by the smallest
     Gauss-Newton steps, so that a plant with many equilibria keeps to the one nearby.
 
+    Example:
+        >>> learnt = systems.RatePlant(lambda x, u: 1e-3 - x.sin() + 0.1 * u, dim=1, inputs=1)
+        >>> rest = systems.find_equilibrium(learnt, [0.1])
+        >>> cost = adp.QuadraticCost(1.0, 1.0, 1, 1, target=rest.state, target_input=rest.input)
+
+        Shown by `staf_torch/adp/README.md`.
+
     Args:
         plant: the plant.
         x: the guess of the state, (n,).
-        u: the guess of the input, (m,).
+        u: the guess of the input, (m,); by default the resting input of the plant.
 
     Raises:
         ValueError: if there is none near the guess; the message says which coordinate keeps moving.
     """
+    x = torch.as_tensor(x, dtype=torch.float64)
+    u = plant.resting_input() if u is None else torch.as_tensor(u, dtype=torch.float64)
     held = resting_input_at(plant, x, u)
     if bool(torch.isfinite(held).all()) and _rests(plant, x, held):
-        return x, held
+        return Equilibrium(x, held)
     size = len(x)
     z = _gauss_newton(lambda v: _motions(plant, v[:, :size], v[:, size:]), torch.cat((x, u)))
     if bool(torch.isfinite(z).all()) and _rests(plant, z[:size], z[size:]):
-        return z[:size], z[size:]
+        return Equilibrium(z[:size], z[size:])
     moves = _motion(plant, x, u)
     worst = int(moves.abs().argmax())
     raise ValueError(
@@ -102,7 +145,15 @@ def _rests(plant: Plant, x: Tensor, u: Tensor) -> bool:
 
 def _motions(plant: Plant, x: Tensor, u: Tensor) -> Tensor:
     with torch.no_grad():
-        return plant.motion(x, u)
+        try:
+            return plant.motion(x, u)
+        except RuntimeError as error:
+            if "dtype" not in str(error) or x.dtype != torch.float64:
+                raise
+            raise ValueError(
+                f"{type(plant).__name__} cannot be asked in float64, which designs and checks need: {error}. "
+                "Call `.double()` of the plant, or cast inside it."
+            ) from error
 
 
 def _motion(plant: Plant, x: Tensor, u: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import logging
 from collections.abc import Sequence
 from typing import Self
 
@@ -15,6 +16,7 @@ from .black_box import BlackBox, Motion, Slopes
 from .bounds import Bounds, Limit
 from .equilibria import find_equilibrium
 
+_log = logging.getLogger(__name__)
 Guess = Sequence[float] | Tensor | tuple[Sequence[float] | Tensor, Sequence[float] | Tensor] | None
 
 
@@ -45,7 +47,11 @@ class FunctionPlant(Plant):
         x, u = _guess(name, equilibrium, dim, inputs)
         self.function = BlackBox(f"{name}({argument}=...)", function, x, u, slopes)
         self._rest = x, u
-        self._rest = find_equilibrium(self, x, u)
+        try:
+            rest = find_equilibrium(self, x, u)
+            self._rest = rest.state, rest.input
+        except ValueError as error:  # a plan over a horizon needs none; who regulates asks again
+            _log.info("%s", error)
 
     @property
     def traceable(self) -> bool:
@@ -106,15 +112,15 @@ class StepPlant(FunctionPlant):
         dt: s, the time of a step: the control is held as long, and a step pays dt times the cost rate.
         periodic: coordinates that are angles in rad.
         equilibrium: a guess of the state at rest, or of state and input; zeros by default. The nearest rest
-            is searched: by the input alone, then by both.
+            is searched: by the input alone, then by both. Where there is none the guess stays, and only what
+            regulates is refused.
         low: of the inputs, as in `Bounds`.
         high: likewise.
         slopes: dx+/dx (n, n) and dx+/du (n, m) at a state (n,) and an input (m,), where a simulator knows
             them: NumPy arrays of NumPy arrays.
 
     Raises:
-        ValueError: if an argument breaks its rule, the function raises, returns other shapes or ignores u, or
-            the plant does not rest near the guess.
+        ValueError: if an argument breaks its rule, the function raises, returns other shapes or ignores u.
     """
 
     def __init__(

@@ -8,16 +8,17 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ...numerics.linalg import slope_of
 from ...systems import ControlAffineSystem
 from ..problem.cost import Cost, matvec
 from .bases import ValueBasis
 
 
 def value_gradient(value: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
-    """grad V, row by row: (..., n) -> (..., n)."""
+    """grad V, row by row, 0 where V is constant: (..., n) -> (..., n)."""
     with torch.enable_grad():
         at = x.detach().requires_grad_()
-        return torch.autograd.grad(value(at).sum(), at)[0]
+        return slope_of(value(at), at)
 
 
 def hjb_residual(

@@ -84,7 +84,7 @@ class SampledProblem(nn.Module):
         goal: Tensor | None = None,
         rest: Tensor | None = None,
         path: Path | None = None,
-        terminal: Tensor | float | EndValue | None = None,
+        terminal: Matrix | EndValue | None = None,
     ) -> None:
         super().__init__()
         self.step = step
@@ -267,7 +267,7 @@ class SampledProblem(nn.Module):
         first, second = _slopes_and_bends(one, x, 1)
         return first[:, 0], second[:, 0]
 
-    def _end(self, terminal: Tensor | float | EndValue | None) -> Tensor:
+    def _end(self, terminal: Matrix | EndValue | None) -> Tensor:
         """S of the terminal cost, (n, n), checked; 0 where that is a function."""
         if terminal is None:
             return self.p.clone()

@@ -143,7 +143,8 @@ class DirectShooting:
         self.bases, self.alone = given, base is None and self.lqr is None
         self.terminal = self._end(terminal)
         x = set_point(system, cost)[0]
-        self.stays = not restless(system, cost) and float(self.terminal(x.unsqueeze(0)).abs()) <= _NOTHING
+        ends = float(self.terminal(x.unsqueeze(0)).detach().abs())
+        self.stays = ends <= _NOTHING and not restless(system, cost)
         self.quadratic_end = not callable(cost.ending if terminal is None else terminal)
         self.stated = (horizon, intervals)
         chosen = _DECAY / rates[0] if horizon is None else horizon

@@ -1,0 +1,129 @@
+"""Plants, costs, constraints and policies with parameters that want gradients are taken as they are."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from helpers import tensor
+from torch import Tensor, nn
+
+from staf_torch import adp, systems
+
+COST = adp.QuadraticCost(1.0, 0.1, dim=2, inputs=1)
+X0 = tensor([[0.3, 0.0], [-0.2, 0.1]])
+
+
+def network(inputs: int, outputs: int, dtype: torch.dtype = torch.float64) -> nn.Sequential:
+    torch.manual_seed(1)
+    net = nn.Sequential(nn.Linear(inputs, 6), nn.Tanh(), nn.Linear(6, outputs))
+    return net.to(dtype)
+
+
+NET = network(3, 2)
+STEP = systems.StepPlant(lambda x, u: x + 0.05 * NET(torch.cat((x, u), -1)), dim=2, inputs=1, dt=0.05)
+RATE = systems.RatePlant(lambda x, u: NET(torch.cat((x, u), -1)), dim=2, inputs=1)
+
+
+class Own(systems.ControlAffineSystem):
+    dim, inputs = 2, 1
+
+    def __init__(self, dtype: torch.dtype = torch.float64) -> None:
+        super().__init__()
+        self.net, self.push = network(2, 2, dtype), nn.Parameter(torch.tensor([[0.0], [1.0]], dtype=dtype))
+
+    def drift(self, x: Tensor) -> Tensor:
+        return self.net(x)
+
+    def effectiveness(self, x: Tensor) -> Tensor:
+        return self.push.expand(*x.shape, 1)
+
+
+class Learnt(adp.QuadraticCost):
+    """A cost rate that is the square of a network's output."""
+
+    def __init__(self) -> None:
+        super().__init__(1.0, 0.1, dim=2, inputs=1)
+        self.net = network(2, 1)
+
+    def state_rate(self, x: Tensor) -> Tensor:
+        return self.net(x)[..., 0].square()
+
+
+@pytest.mark.parametrize(
+    ("plant", "cost"), [(STEP, COST), (RATE, COST), (Own(), COST), (systems.Pendulum(), Learnt())]
+)
+def test_every_planner_takes_networks_and_gives_no_gradient(plant: systems.Plant, cost: adp.Cost) -> None:
+    problem = adp.SampledProblem.of(plant, cost, dt=0.05, terminal=0.0)
+    plan = adp.BoxDDP(problem, steps=6, iterations=4, compile=False).solve(X0)
+    assert not plan.cost.requires_grad
+    for planner in (
+        adp.RecedingHorizon(problem, steps=6, compile=False),
+        adp.PathIntegral(problem, steps=6, samples=10, knots=2, noise=0.5, compile=False),
+    ):
+        run = adp.simulate(planner, plant, cost, X0, dt=0.05, steps=2, compile=False)
+        assert torch.isfinite(run.cost).all()
+        assert not run.cost.requires_grad
+    if plant.period is None:
+        shot = adp.DirectShooting(plant, cost, horizon=0.3, intervals=6, terminal=0.0).solve(X0)
+        torch.testing.assert_close(shot.value, plan.cost, rtol=0.05, atol=1e-4)
+
+
+def test_a_learnt_plant_has_the_regulator_of_the_same_plant_without_parameters() -> None:
+    fixed = network(3, 2).requires_grad_(False)
+    other = systems.StepPlant(lambda x, u: x + 0.05 * fixed(torch.cat((x, u), -1)), dim=2, inputs=1, dt=0.05)
+    torch.testing.assert_close(adp.LQR(STEP, COST).k, adp.LQR(other, COST).k)
+    torch.testing.assert_close(
+        adp.SampledProblem.of(STEP, COST).k, adp.SampledProblem.of(other, COST).k, rtol=1e-6, atol=1e-9
+    )
+
+
+def test_policies_and_constraints_that_are_networks_run_and_are_filtered() -> None:
+    policy, plant = network(2, 1), systems.Pendulum()
+    run = adp.simulate(adp.Feedback(policy), plant, COST, X0, dt=0.05, steps=2, compile=False)
+    assert not run.cost.requires_grad
+    wall = network(2, 1)
+    filtered = adp.SafetyFilter(policy, plant, lambda x, t: 2 + wall(x)[..., 0], dt=0.05, low=-5.0, high=5.0)
+    assert torch.isfinite(filtered(X0)).all()
+    assert not adp.held_stability(policy, plant, 0.05).spectral_radius < 0
+
+
+def test_a_set_point_at_which_a_learnt_plant_does_not_rest_names_the_nearest_and_the_call() -> None:
+    aside = adp.QuadraticCost(1.0, 0.1, dim=2, inputs=1, target=[0.0, 0.0])
+    said = r"does not rest at the state \[0.0, 0.0\].*The nearest one is .* away.*systems.find_equilibrium"
+    with pytest.raises(ValueError, match=said):
+        adp.LQR(STEP, aside)
+    with pytest.raises(ValueError, match=r"drift` must be 0 at the origin.*The nearest one is"):
+        adp.LQR(Own(), COST)
+    rest = systems.find_equilibrium(Own(), [0.0, 0.0])
+    torch.testing.assert_close(Own().motion(*rest), torch.zeros(2).double())
+    there = adp.QuadraticCost(1.0, 0.1, dim=2, inputs=1, target=rest.state, target_input=rest.input)
+    lqr = adp.LQR(Own(), there)
+    torch.testing.assert_close(lqr(rest.state), rest.input)
+
+
+def test_a_network_in_float32_says_what_it_says_first_and_what_to_do() -> None:
+    net = network(3, 2, torch.float32)
+    said = r"as torch tensors of float64 RuntimeError \(mat1 and mat2 must have the same dtype.*`.double\(\)`"
+    with pytest.raises(ValueError, match=said):
+        systems.StepPlant(lambda x, u: x + 0.05 * net(torch.cat((x, u), -1)), dim=2, inputs=1, dt=0.05)
+    with pytest.raises(ValueError, match=r"Own cannot be asked in float64.*`.double\(\)` of the plant"):
+        adp.LQR(Own(torch.float32), COST)
+
+
+def test_a_network_without_derivatives_is_a_black_box_of_tensors() -> None:
+    net = network(3, 2)
+
+    def step(x: Tensor, u: Tensor) -> Tensor:
+        with torch.no_grad():
+            return x + 0.05 * net(torch.cat((x, u), -1))
+
+    plant = systems.StepPlant(step, dim=2, inputs=1, dt=0.05)
+    assert not plant.traceable
+    torch.testing.assert_close(adp.LQR(plant, COST).k, adp.LQR(STEP, COST).k, rtol=1e-4, atol=1e-4)
+
+
+def test_a_block_that_small_inputs_do_not_move_is_a_plant() -> None:
+    def rate(x: Tensor, u: Tensor) -> Tensor:
+        return torch.stack((x[:, 1], u[:, 0] - u[:, 0].clamp(-2.0, 2.0) - x[:, 1]), dim=-1)
+
+    assert systems.RatePlant(rate, dim=2, inputs=1).equilibrium().tolist() == [0.0, 0.0]
