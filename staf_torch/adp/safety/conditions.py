@@ -319,6 +319,7 @@ def _reachable(end: Tensor, bounds: Bounds, rest: Tensor) -> Tensor:
     return torch.where(torch.isfinite(end), end, rest.to(end) + torch.sign(end) * far)
 
 
+@torch.no_grad()
 def _brakes(of: Conditions, x: Tensor, t: Tensor) -> _Brakes:
     lean, slopes = Lean(*of.every(of.lean, x, t)), of.every(of.level, x, t)[2].sqrt()
     count, fastest = len(of.constraints), 1 / (_PERIODS * of.hold)

@@ -125,6 +125,7 @@ class SafetyFilter(Controller):
     (2020), for what a backup law keeps.
     """
 
+    @torch.no_grad()  # also of networks, whose parameters want gradients
     def __init__(
         self,
         policy: Policy | Controller,
