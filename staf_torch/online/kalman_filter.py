@@ -314,7 +314,8 @@ class LocalFilter:
         moved = old.usual + rate * (before.unknown.nan_to_num(1.0) - old.usual)
         usual = torch.where(says.any(0), torch.where(since > 0, moved, 0.0), old.usual)
         good = fine & (spread > 0) & (mean.abs().amax((0, 1)) <= most) & torch.isfinite(learned.sum((0, 1)))
-        return StateParts(old.anchor, old.last, mean, learned, *own, usual, largest), good
+        parts = (old.anchor, old.last, mean, learned, *own, usual, largest)
+        return StateParts._make(parts), good
 
     def _errors(self, old: StateParts, away: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
         """Errors and surprises after an error of so many deviations."""

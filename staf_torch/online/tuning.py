@@ -71,8 +71,8 @@ def tuning(x: Tensor, y: Tensor, directions: Tensor) -> Tuning:
     """
     both = torch.cat((x, y), -1).double()
     seen = torch.isfinite(both)
-    units = units_of(torch.where(seen, both, torch.nan).flatten(1))
-    center, spread = (part.unflatten(0, both.shape[1:]) for part in units)
+    learned = units_of(torch.where(seen, both, torch.nan).flatten(1))
+    center, spread = (part.unflatten(0, both.shape[1:]) for part in learned)
     samples = (both - center) / spread
     samples = torch.where(samples.abs() < MOST, samples, torch.nan)
     n, streams = x.shape[-1], x.shape[1]

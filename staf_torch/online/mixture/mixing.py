@@ -151,11 +151,11 @@ def judge(r: Rules, s: dict[str, Tensor], value: Tensor, told: Tensor, t: float)
     over = _scores(r, value[:, None] - s["mixed"], s["mixed_variance"], s["error"][:, None])
     old, rate = s["excess"], max(r.members_rate, 1 / (t + 3))
     ratio, logs = away.square() / v.clamp(min=_LEAST), v.clamp(min=_LEAST).log()
-    most = SURPRISE * row[:, None]
-    put("excess", (old + rate * (torch.minimum(ratio, most * old) - old)).clamp(r.least, 1e8))
+    larger = SURPRISE * row[:, None]
+    put("excess", (old + rate * (torch.minimum(ratio, larger * old) - old)).clamp(r.least, 1e8))
     put("usual", s["usual"] + max(r.members_rate, 1 / (t + 1)) * (logs - s["usual"]))
     of = slice(LOCAL + CARRIED, LOCAL + CARRIED + QUADRATIC)
-    factor = 1 + max(r.pace, 1 / (t + 2)) * (torch.minimum(ratio[:, of], most) - 1)
+    factor = 1 + max(r.pace, 1 / (t + 2)) * (torch.minimum(ratio[:, of], larger) - 1)
     put("quadratic_error", (s["quadratic_error"] * factor).clamp(min=1e-26))
     discounts = torch.tensor(r.discounts, dtype=torch.float64)[:, None]
     put("weights", _reweighed(r.share, discounts * s["weights"] + score[:, None]))

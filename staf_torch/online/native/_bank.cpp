@@ -19,7 +19,7 @@ static Filter filters_of(const Stream &s) {
     return f;
 }
 static Law law_of(const Rules &r) {
-    Law law{all(r.carried_ratio), V{}, all(square(r.carried_slack)), all(infinity), all(1), 0, std::numeric_limits<double>::max()};
+    Law law{all(r.carried_ratio), V{}, all(square(r.carried_slack)), all(infinity), 1, 0, std::numeric_limits<double>::max()};
     for (int l = 0; l < lanes; ++l) law.forgetting[l] = r.carried_forgetting[l];
     return law;
 }

@@ -90,7 +90,7 @@ INLINE void read(const Call &call, int64_t first, int count, Filter &s) {
 
 INLINE Law law_of(const Call &call, int64_t first, int count) {
     const V ratio = column(call.ratio + first, 1, count), forgetting = column(call.forgetting + first, 1, count);
-    return {ratio, forgetting, all(call.slack2), all(call.robust), all(call.base), call.tiny, call.most};
+    return {ratio, forgetting, all(call.slack2), all(call.robust), std::sqrt(call.base), call.tiny, call.most};
 }
 
 static void tell(const Call &call) {

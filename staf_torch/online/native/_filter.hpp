@@ -84,7 +84,8 @@ struct Filter {  // of lanes streams
 };
 
 struct Law {
-    V ratio, forgetting, slack2, robust, base;  // base: variance of the process in the units of y, at first
+    V ratio, forgetting, slack2, robust;
+    double size;  // standard deviation of the process in the units of y, at first
     double tiny, most;  // the square root of the precision of the streams, their largest number
 };
 
@@ -182,15 +183,19 @@ INLINE V moments(const Functions &f, const V *z, const V known[K + 1][M], Get le
 
 // The deviation of y, that of the prior where it has been constant; and the amplitude that the errors say.
 INLINE V spread_of(const Law &law, const Filter &s, int o) {
-    return s.spread[o] > 1e-15 * absolute(s.level[o]) ? s.spread[o] : root(law.base);
+    return s.spread[o] > 1e-15 * absolute(s.level[o]) ? s.spread[o] : all(law.size);
 }
 INLINE V amplitude_of(const Law &law, const Filter &s, int o) {
-    const V trust = minimum(maximum(s.told[o] - 2., V{}), all(20)) / 20.;
-    return maximum(hypotenuse(s.errors[o] * root(trust), root(law.base * (1. - trust))), least_part * spread_of(law, s, o));
+    V found = s.errors[o];
+    if (any(s.told[o] < 22.)) {  // roots take time
+        const V trust = minimum(maximum(s.told[o] - 2., V{}), all(20)) / 20.;
+        found = hypotenuse(s.errors[o] * root(trust), law.size * root(1. - trust));
+    }
+    return maximum(found, least_part * spread_of(law, s, o));
 }
 
 struct Outlook {  // on the next y
-    V mean[K], deviation[K], weight[K];  // weight: of its square, what the amplitude makes
+    V mean[K], deviation[K], weight[K], amplitude[K];  // weight: of the square, what the amplitude makes
 };
 // From psi'u of every output and of one that is always 1, and the share of V's variance that is unknown.
 INLINE Outlook outlook(const Law &law, const Filter &s, const V *expected, V unknown) {
@@ -199,7 +204,8 @@ INLINE Outlook outlook(const Law &law, const Filter &s, const V *expected, V unk
     const V away = minimum(maximum((unknown - most) / maximum(1. - most, all(1e-9)), V{}), all(1));
     const V part = root(minimum(unknown, most) + law.ratio);
     for (int o = 0; o < K; ++o) {
-        const V near = amplitude_of(law, s, o) * part, far = maximum(spread_of(law, s, o), near);
+        found.amplitude[o] = amplitude_of(law, s, o);
+        const V near = found.amplitude[o] * part, far = maximum(spread_of(law, s, o), near);
         const V square = (near / far) * (near / far), whole = away + (1. - away) * square;
         found.mean[o] = expected[o] + s.level[o] * (1. - one);
         found.deviation[o] = far * root(whole), found.weight[o] = square < 1. ? (1. - away) * square / whole : all(1);
@@ -218,7 +224,7 @@ INLINE void predict(const Functions &f, const Law &law, const Filter &s, Get lea
     const Mask fresh = is_fresh(s);
     for (int o = 0; o < K; ++o) {
         mean[o] = fresh ? V{} : found.mean[o];
-        deviation[o] = fresh ? root(law.base * (1. + law.ratio)) : found.deviation[o];
+        deviation[o] = fresh ? law.size * root(1. + law.ratio) : found.deviation[o];
     }
 }
 
@@ -268,18 +274,24 @@ INLINE V limited(V value, V running, V told, V &row) {
     return value;
 }
 // The running errors of an output after one of so many deviations, and the running mean and deviation of y.
-INLINE void learn_scales(const Law &law, Filter &s, int o, V y, V away, V weight, Mask good) {
+INLINE void learn_scales(const Law &law, Filter &s, int o, V y, V away, V weight, V amplitude, Mask good) {
     const V inside = maximum(1. + weight * (away * away - 1.), V{}), told = s.told[o], spread = spread_of(law, s, o);
-    const V counted = minimum(amplitude_of(law, s, o) * root(inside), all(1e300));
+    const V counted = minimum(amplitude * root(inside), all(1e300));
     V surprises = s.surprises[o], leaps = s.leaps[o];
     const V size = limited(counted, maximum(s.errors[o], least_part * spread), told, surprises);
-    const V rate = maximum(1. / maximum(told - 1., all(1)), all(error_rate));
-    const V errors = minimum(hypotenuse(root(1. - rate) * s.errors[o], root(rate) * size), all(law.most));
+    V kept = all(std::sqrt(1 - error_rate)), taken = all(std::sqrt(error_rate));
+    V slow = all(spread_rate), fading = all(std::sqrt(1 - spread_rate)), coming = all(std::sqrt(spread_rate));
+    if (any(told < 2 / spread_rate)) {  // roots take time
+        const V rate = maximum(1. / maximum(told - 1., all(1)), all(error_rate));
+        kept = root(1. - rate), taken = root(rate);
+        slow = maximum(minimum(3. / (told + 3.), 1. / maximum(told - 40., all(1))), all(spread_rate));
+        fading = root(1. - slow), coming = root(slow);
+    }
+    const V errors = minimum(hypotenuse(kept * s.errors[o], taken * size), all(law.most));
     s.errors[o] = good ? (told >= 2. ? errors : V{}) : s.errors[o];
     s.surprises[o] = good ? surprises : s.surprises[o];
-    const V slow = maximum(minimum(3. / (told + 3.), 1. / maximum(told - 40., all(1))), all(spread_rate));
     const V apart = limited(absolute(y - s.level[o]), spread, told, leaps), step = y < s.level[o] ? -apart : apart;
-    const V deviation = minimum(root(1. - slow) * hypotenuse(s.spread[o], root(slow) * step), all(law.most));
+    const V deviation = minimum(fading * hypotenuse(s.spread[o], coming * step), all(law.most));
     const V level = minimum(maximum(s.level[o] + slow * step, all(-law.most)), all(law.most));
     s.told[o] = good & ((deviation > 0.) | (told == 0.)) ? minimum(told + 1., all(2 / spread_rate)) : told;
     s.level[o] = good ? level : s.level[o], s.spread[o] = good ? deviation : s.spread[o];
@@ -344,7 +356,7 @@ INLINE Mask update(const Functions &f, const Law &law, Filter &s, Get learned, P
     Mask some{};
     for (int o = 0; o < K; ++o) {  // a sample that repeats the last one says nothing of errors, unless all have been alike
         const Mask says = good & seen[o] & ~(stays & (y[o] == s.value[o]) & (s.told[o] >= 2.));
-        learn_scales(law, s, o, y[o], away[o], view.weight[o], says);
+        learn_scales(law, s, o, y[o], away[o], view.weight[o], view.amplitude[o], says);
         s.value[o] = good & seen[o] ? y[o] : s.value[o], some |= says;
     }
     const V followed = maximum(1. / maximum(s.since, all(1)), all(error_rate));
