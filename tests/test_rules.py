@@ -200,7 +200,6 @@ CALLS: dict[str, Callable[..., Any]] = {
     "RecedingHorizon": of(adp.RecedingHorizon, INTEGRATOR, steps=4, compile=False),
     "PathIntegral": of(adp.PathIntegral, INTEGRATOR, steps=4, knots=2, compile=False),
     "SampledProblem": of(adp.SampledProblem, INTEGRATOR.step, dim=2, inputs=1),
-    "SampledProblem.of": of(adp.SampledProblem.of, PLANT, COST, dt=0.1),
     "GlobalValue": of(adp.GlobalValue, INTEGRATOR, LIBRARY, [3.0, 3.0]),
     "learn_global_value": of(
         adp.learn_global_value, INTEGRATOR, region=[1.0, 1.0], steps=40, trajectories=2, rounds=0, states=1
