@@ -283,7 +283,7 @@ class SafetyFilter(Controller):
         shortfall, margin, strain = of.every(of.shortfall, x, at, t)
         asked = shortfall.amax(-1)
         u, slack = self._linearised(x, at, first, t, asked)
-        astray = torch.zeros_like(slack)
+        astray, short = torch.zeros_like(slack), -margin.amin(-1)  # h < 0 is never well
         if self.ahead.acts:
             look = slack > _SLACK
             if not of.apart:
@@ -294,15 +294,13 @@ class SafetyFilter(Controller):
             elif self.ahead.weak:
                 look = t == t
             chosen = self.ahead.choose(self._policy, (at, u, x, t), look)
-            missing = where_rows(chosen.left < 0, self._lacking, (x, t, -chosen.left), slack)
             u = torch.where(look.unsqueeze(-1), chosen.control, u)
             # A barrier of degree two that the bounds cannot meet is no loss where the brakes do.
             forgiven = slack if 1 in self.degree and not self.ahead.opposed else torch.zeros_like(slack)
-            after = torch.where(chosen.left < 0, torch.maximum(slack, missing), forgiven)
-            slack = torch.where(look, after, slack)
-        outside = -margin.amin(-1)
-        missing = where_rows(outside > 0, self._lacking, (x, t, outside), slack)
-        slack = torch.where(outside > 0, torch.maximum(slack, missing), slack)
+            slack = torch.where(look & (chosen.left == 0), forgiven, slack)
+            short = torch.where(look, torch.maximum(short, -chosen.left), short)
+        missing = where_rows(short > 0, self._lacking, (x, t, short), slack)
+        slack = torch.where(short > 0, torch.maximum(slack, missing), slack)
         more = (slack, astray) if self.ahead.opposed else (slack,)
         found = torch.cat((u, margin, torch.stack(more, dim=-1)), dim=-1)
         return found.reshape(*z.shape[:-1], -1)
