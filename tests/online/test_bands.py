@@ -65,6 +65,14 @@ def test_the_band_far_from_the_data_is_their_spread(kind: str, unit: float, offs
         assert abs(float(mean - y.mean())) < 1.5 * float(std)
 
 
+def test_the_band_of_a_mixture_is_no_wider_far_away_in_the_plane() -> None:
+    x, y = stream()
+    model = MODELS["mixture"]().fit(x, y)
+    for far in ([3.0, 3.0], [50.0, 50.0]):
+        mean, std = model.predict(torch.tensor(far).double(), return_std=True)
+        assert abs(float(mean - y.mean())) < 2 * float(std) < 8 * float(y.std())
+
+
 @over(PLAIN, "kind")
 def test_a_constant_stream_says_nothing_of_other_places(kind: str) -> None:
     x = 3 + 2 * (0.1 * torch.arange(60, dtype=torch.float64)).sin()

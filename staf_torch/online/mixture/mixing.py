@@ -25,7 +25,7 @@ def _let_go(s: dict[str, Tensor], level: Tensor, wide: Tensor) -> None:
     away = ((s["unknown"] - most) / (1 - most).clamp(min=1e-9)).clamp(0.0, 1.0)
     far = torch.where(still, 1.0, wide.square()) + (s["mean"] - level).square()
     near = torch.where(still, s["variance"].clamp(min=_STILL), s["variance"])
-    s["variance"].copy_(near + away * (far - near).clamp(min=0.0))
+    s["variance"].copy_(near + away * (far - near))
     s["weight"].copy_(torch.where(near < far, (1 - away) * near / s["variance"], 1.0))
 
 

@@ -202,7 +202,7 @@ static void let_go(const Rules &r, Stream &s, int o) {
     const double middle = in_units(r, s, o, s.level[o]);
     const double far = square(s.mean[o] - middle) + (constant(s, o) ? 1 : square(s.wide[o] / scale_of(r, s, n + o)));
     const double near = s.variance[o] = std::max(s.variance[o], constant(s, o) ? still : 0);
-    s.variance[o] = near + away * std::max(far - near, 0.);
+    s.variance[o] = near + away * (far - near);
     s.weight[o] = near < far ? (1 - away) * near / s.variance[o] : 1;
 }
 
