@@ -368,11 +368,24 @@ WRONG: dict[str, tuple[object, ...]] = {
 EDGE: dict[str, tuple[object, ...]] = {"non_negative": (0.0,), "flag": (True, False)}
 ABSENT = {
     *("RBFGridBasis.width", "Supervised.momentum", "HeavyBall.momentum", "Nesterov.momentum"),
-    *("HeavyBall.step", "RolloutPolicy.period", "DirectShooting.horizon", "StaF.out_features"),
+    *(
+        "HeavyBall.step",
+        "RolloutPolicy.period",
+        "RolloutPolicy.steps",
+        "DirectShooting.horizon",
+        "StaF.out_features",
+    ),
     *("IntegralWindows.first", "LeastSquares.alarm", "HistoryStack.outputs"),
     *("PlantEnv.bound", "PlantEnv.spread", "PlantVectorEnv.spread"),
     *("DirectShooting.iterations", "DirectShooting.intervals"),
-    *("simulate.seed", "trajectory.chunk", "near_optimal.dt", "near_optimal.horizon", "report.spread"),
+    *(
+        "simulate.seed",
+        "simulate.dt",
+        "trajectory.chunk",
+        "near_optimal.dt",
+        "near_optimal.horizon",
+        "report.spread",
+    ),
     *("SafetyFilter.weight", "SafetyFilter.decay", "BoundedInputCost.bound", "PathIntegral.noise"),
 }
 """Arguments for which None has a meaning of its own."""

@@ -92,10 +92,13 @@ def exponential_step(
         both = torch.zeros(n, 5 * n, dtype=torch.float64)
         both[:, :n] = both[:, 4 * n :] = torch.eye(n, dtype=torch.float64)
         rate = both.mT @ curvature.double() @ both
-        _, integral = quadratic_integral(whole - 0.5 * discount * torch.eye(5 * n).double(), rate, h)
-        stages = torch.tensor([[1.0, 0.0, 0.0], [-3 / h, 4 / h, -1 / h], [4 / h**2, -8 / h**2, 4 / h**2]])
+        _, integral = quadratic_integral(
+            whole - 0.5 * discount * torch.eye(5 * n, dtype=torch.float64), rate, h
+        )
+        rows = (1.0, 0.0, 0.0), (-3 / h, 4 / h, -1 / h), (4 / h**2, -8 / h**2, 4 / h**2)
+        stages = torch.tensor(rows, dtype=torch.float64)
         basis = torch.zeros(5, 4, dtype=torch.float64)
-        basis[1:4, 1:], basis[4, 0] = stages.double(), 1.0
+        basis[1:4, 1:], basis[4, 0] = stages, 1.0
         turned = torch.kron(basis, torch.eye(n, dtype=torch.float64))
         paid = turned.mT @ integral @ turned
     return ExponentialStep(a, begun, before, weight, starts, paid)
@@ -183,7 +186,7 @@ def stalls(error: float, last: float) -> bool:
     return error <= _SMALL and error * _NEAR > last
 
 
-class Needed(NamedTuple):
+class StepsNeeded(NamedTuple):
     """What rows need."""
 
     factor: Tensor  # (R,) int64, times the steps
@@ -192,7 +195,7 @@ class Needed(NamedTuple):
 
 def needed_steps(
     errors: Callable[[Tensor, int], Tensor], most: Tensor, tolerance: float, enough: float
-) -> Needed:
+) -> StepsNeeded:
     """Return how many times more steps every row needs, by doubling: nothing of another row is looked at.
 
     Args:
@@ -211,4 +214,4 @@ def needed_steps(
         stalled = torch.tensor([stalls(one, before) for one, before in pairs], dtype=torch.bool)
         further = (now > (enough if times == 1 else tolerance)) & ~stalled & (2 * times <= most[rows])
         rows, last, times = rows[further], now[further], 2 * times
-    return Needed(factor, error)
+    return StepsNeeded(factor, error)

@@ -129,7 +129,7 @@ def _refined(
         wrong = torch.where(known[some], (now - better).abs().amax(-1), 0.0).amax(1)
         return (wrong / torch.where(known[some], size, 0.0).amax(1)).nan_to_num(math.inf, math.inf)
 
-    most = torch.full((len(rows),), _MOST)
+    most = torch.full((len(rows),), _MOST, dtype=torch.int64)
     found = needed_steps(errors, most, _TOLERANCE, 10 * _TOLERANCE)
     for factor in found.factor.unique().tolist():
         chosen = rows[(found.factor == factor).to(rows.device)]

@@ -11,20 +11,21 @@ import logging
 import math
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from ...numerics.exponential_step import Needed, needed_steps
+from ...numerics.exponential_step import StepsNeeded, needed_steps
 from ..problem.held_plant import GRACE, TOLERANCE, Holding
 
 _log = logging.getLogger(__name__)
 BENT = 3e-3  # of the state: more bending is looked at; of a mode (h / tau)^3 / 4, beside an error of 5e-6
 _TRIED = 16  # holds of a row
+_MODELS = 100.0  # times the tolerance, before a controller's model is a warning
 _MOST, _MOST_FROZEN = 1024, 64  # times the steps; of a row that left the finite numbers
 _TOGETHER = 1 << 16  # holds that are repeated at once
 
 
 @torch.no_grad()
-def needed(holding: Holding, x: Tensor, u: Tensor, frozen: Tensor, most: int = _MOST) -> Needed:
+def needed(holding: Holding, x: Tensor, u: Tensor, frozen: Tensor, most: int = _MOST) -> StepsNeeded:
     """Return by how much rows must multiply their steps for 1e-6 in all of their holds.
 
     Args:
@@ -87,7 +88,25 @@ def hardest(
     return torch.cat((x, state[:, -1:]), dim=1), torch.cat((u, before), dim=1)
 
 
-def warn_of_errors(holding: Holding, rows: Tensor, found: Needed, remedy: str) -> None:
+def warn_of_models(controller: nn.Module, x: Tensor, u: Tensor) -> None:
+    """Say in the log which models of a controller are wrong in holds (R, K, n), (R, K, m) of the plant."""
+    known = torch.isfinite(u).all(-1) & torch.isfinite(x).all(-1)
+    for part in controller.modules():
+        holding = getattr(part, "holding", None)
+        if not isinstance(holding, Holding) or holding.plant.period is not None:
+            continue
+        if holding.plant.dim != x.shape[-1] or not bool(known.any()):
+            continue
+        found = holding.errors(x[known], u[known])
+        if float(found.max()) > _MODELS * TOLERANCE:
+            _log.warning(
+                "`simulate`: the model of %s, %d integration steps in %.4g s, is wrong by up to %.2g of the "
+                "state where the plant went, and so are its plans there. More `substeps` would do.",
+                *(type(part).__name__, holding.steps, holding.dt, float(found.max())),
+            )
+
+
+def warn_of_errors(holding: Holding, rows: Tensor, found: StepsNeeded, remedy: str) -> None:
     """Say in the log which rows were integrated with errors that matter."""
     wrong = found.error > GRACE * TOLERANCE
     if not bool(wrong.any()):

@@ -21,7 +21,7 @@ from ...systems import ControlAffineSystem, Plant
 from ..problem.cost import Cost
 from ..problem.held_plant import RESOLVED, Holding, Substeps, fewest_and_most
 from ..problem.rules import warn_if_restless, warn_if_unstable
-from .accuracy import BENT, hardest, needed, warn_of_errors
+from .accuracy import BENT, hardest, needed, warn_of_errors, warn_of_models
 from .controller import Carried, Controller, Feedback, Policy
 from .step import ClosedLoop, LoopState, program, record, row_numbers
 
@@ -200,7 +200,7 @@ def simulate(
         _log.warning(
             "the closed loop runs in plain torch, slower: its plant is no torch (NumPy, a simulator)"
         )
-    whole = _Run(x0, steps, every, _seeds(seed, len(x0)), compile, progress)
+    whole = _LoopRun(x0, steps, every, _seeds(seed, len(x0)), compile, progress)
     with torch.no_grad():
         result, last = whole.of(loop)
         seen = result.state[:, :: max(1, result.state.shape[1] // _SEEN)]
@@ -225,7 +225,7 @@ def _beginning(loop: ClosedLoop, plain: Program, steps: int) -> LoopProgram:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Run:
+class _LoopRun:
     """What `simulate` runs, again for some rows with other steps."""
 
     x0: Tensor
@@ -253,6 +253,7 @@ class _Run:
         frozen = result.diverged[at]
         moves = hardest(loop.holding, result.state[at], result.control[at], rest, frozen)
         found = needed(loop.holding, *moves, frozen)
+        warn_of_models(loop.controller, *moves)
         if not again:
             one = needed(loop.holding, *moves, torch.ones_like(frozen), most=1)
             warn_of_errors(loop.holding, at, one, "Leave `substeps` and `integrator` as they are by default.")
