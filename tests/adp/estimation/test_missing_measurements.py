@@ -111,7 +111,7 @@ def adaptive(name: str) -> adp.Controller:
 
 @pytest.mark.parametrize("name", ["lqr", "filtered", "actor-critic", "robust filter", "drift"])
 def test_an_adaptive_controller_holds_counts_and_learns_on_where_measurements_are_missing(name: str) -> None:
-    steps = 25 if name == "robust filter" else 50  # it takes its time in plain torch
+    steps = 25 if name in ("robust filter", "drift") else 50  # they take their time in plain torch
     healthy, lossy = (run(adaptive(name), PENDULUM, rows, steps=steps) for rows in ([], [1]))
     assert not bool(lossy.diverged.any())
     assert lossy["missed"][:, -1].tolist() == [0.0, steps / 5, 0.0]
