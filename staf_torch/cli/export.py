@@ -15,9 +15,8 @@ from torch import Tensor
 
 from .. import __version__
 from ..deploy import c_header, export_learning_c, formats, sheet, trace
-from ..deploy.counted import counted
 from ..deploy.names import made_name
-from ..deploy.onnx_loops import with_loops
+from ..deploy.onnx_loops import in_loops
 from ..deploy.sheet import Port
 from ..lanes.emit.identifiers import checked_names
 from ..numerics.checks import choice, fail
@@ -213,12 +212,11 @@ def _write(
 ) -> tuple[formats.Run, sheet.Work]:
     names, name, example = [port.name for port in found.outputs], str(origin["name"]), found.points.to(dtype)
     if to == "onnx":
-        loops = with_loops(module, example)
-        if loops is not None:
+        written = in_loops(module, example, [found.input.name, *names], batch, name)
+        if written is not None:
+            path.write_bytes(written.model.SerializeToString())
             entries = example.shape[1] + sum(port.size or 1 for port in found.outputs)
-            ports = [found.input.name], names
-            formats.export_onnx(module, path, *ports, example=example, batch=batch, name=name)
-            return formats.runner_onnx(path), counted(loops).work(entries, dtype)
+            return formats.runner_onnx(path), written.source.work(entries, dtype)
     program = trace(module, example, batch=batch)
     if to == "onnx":
         formats.export_onnx(program, path, [found.input.name], names, name=name)

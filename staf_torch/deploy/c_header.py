@@ -17,13 +17,14 @@ from torch import Tensor, nn
 from ..adp import Controller
 from ..lanes import Program
 from ..lanes.call import Given
-from ..lanes.emit.identifiers import checked_names
+from ..lanes.emit.c import commented
+from ..lanes.emit.identifiers import checked_names, guarded
 from ..lanes.trace.graph import WIDE
 from ..lanes.trace.step import trace
 from ..lanes.trace.tracer import NotLoweredError
 from ..lanes.tree import Tree, flatten, labels
 from ..numerics.checks import fail
-from .controllers import check_bounded, in_dtype
+from .controllers import FilteredPolicy, SupervisedPolicy, check_bounded, in_dtype, searches
 from .counted import Source, counted
 from .formats import Run, as_tuple
 from .names import check_count, check_dtype, function_name, listed_names
@@ -71,9 +72,12 @@ def export_c(
     name = function_name("export_c", name, module, ["state", *outputs])
     checked_names("export_c", "outputs", outputs, ["state"])
     check_dtype("export_c", module, example)
-    if isinstance(module, RememberedPolicy):
+    if isinstance(module, RememberedPolicy) or searches(module):
         check_count("export_c", outputs, 1)
-        return _write_remembered(path, module, example[:1], name, outputs, note)
+        body, source, compared = _searching(module, example[:1], name, outputs[0])
+        said = _said(note, source, f"compares {compared} states and takes at most")
+        path.write_text(commented(said) + guarded(name, body), encoding="utf-8")
+        return source
     program = Program(lambda carry, now, row: (carry, as_tuple(module(row["state"]))), name="the header")
     return _write(path, program, (), {"state": example[:1]}, name, outputs, note)
 
@@ -139,19 +143,30 @@ def _write(
     return source
 
 
-def _write_remembered(
-    path: Path, module: RememberedPolicy, x: Tensor, name: str, outputs: Sequence[str], note: str
-) -> Source:
-    program, row, names = module.program(), module.row(x), ["cost", "control"]
-    one, _ = _counted(program, (), row)
-    plans, (searched, n) = module.candidates + 1, module.searched.shape
-    compared = searched * (3 * n + 1) + n * (2 * n + 4)
-    tables = sum(getattr(module, name).numel() for name in ("plans", "models", "searched"))
-    whole = Source(tables + one.constants, plans * one.flops + compared, plans * one.functions)
-    follow = program.c_source(f"{name}_follow", (), (), row, outputs=names)
-    said = _said(note, whole, f"compares {searched} states and takes at most")
-    path.write_text(module.c_text(name, follow, outputs, said), encoding="utf-8")
-    return whole
+def _searching(module: nn.Module, x: Tensor, name: str, output: str) -> tuple[str, Source, int]:
+    """Return the text of a policy that searches a memory, or is around one, its cost, and states compared."""
+    if isinstance(module, RememberedPolicy):
+        program, row = module.program(), module.row(x)
+        one, _ = _counted(program, (), row)
+        follow = program.c_source(f"{name}_follow", (), (), row, outputs=["cost", "control"])
+        return module.c_text(name, follow, output), module.source(one), len(module.searched)
+    assert isinstance(module, FilteredPolicy | SupervisedPolicy)
+    inner = x[:, : module.plant_size] if isinstance(module, FilteredPolicy) else x
+    body, source, compared = _searching(module.policy, inner, f"{name}_policy", "control")
+    row = {"state": x, "wanted": module.policy(inner)}
+    program = Program(
+        lambda c, _, row: (c, (module.restrained(row["state"], row["wanted"]),)), name="a filter"
+    )
+    more, _ = _counted(program, (), row)
+    text = program.c_source(f"{name}_restrained", (), (), row, outputs=["control"])
+    real, size, inputs = _c_type(x.dtype), x.shape[-1], row["wanted"].shape[-1]
+    lines = [
+        f"static inline void {name}(const {real} state[{size}], {real} {output}[{inputs}])",
+        f"{{\n    {real} wanted[{inputs}];",
+        f"    {name}_policy(state, wanted);\n    {name}_restrained(state, wanted, {output});\n}}",
+    ]
+    whole = Source(*(a + b for a, b in zip(source, more, strict=True)))
+    return "\n".join([body, text, *lines]), whole, compared
 
 
 def _counted(program: Program, carry: Tree, row: Tree) -> tuple[Source, int]:

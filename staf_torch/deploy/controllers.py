@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import gc
 from types import FunctionType, ModuleType
-from typing import Any, TypeVar
+from typing import Any, TypeGuard, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -94,7 +94,11 @@ class SupervisedPolicy(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """u: (..., n) -> (..., m)."""
-        return self.supervisor.restrain(x, self.policy(x))
+        return self.restrained(x, self.policy(x))
+
+    def restrained(self, x: Tensor, u: Tensor) -> Tensor:
+        """Return the control in place of u: (..., n), (..., m)."""
+        return self.supervisor.restrain(x, u)
 
 
 class FilteredPolicy(nn.Module):
@@ -122,8 +126,17 @@ class FilteredPolicy(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """u: (..., n), or (..., n + 1) with the time, -> (..., m)."""
-        u: Tensor = self.filter(x[..., :-1], x[..., -1]) if self.filter.moving else self.filter(x)
-        return u
+        return self.restrained(x, self.policy(x[..., : self.plant_size]))
+
+    @property
+    def plant_size(self) -> int:
+        """n."""
+        return int(self.filter.plant.equilibrium().numel())
+
+    def restrained(self, x: Tensor, u: Tensor) -> Tensor:
+        """Return the control in place of u: (..., n), or (..., n + 1) with the time, and (..., m)."""
+        moving = (x[..., :-1], u, x[..., -1]) if self.filter.moving else (x, u)
+        return self.filter.restrain(*moving).control
 
 
 class FoldedRollout(nn.Module):
@@ -183,6 +196,13 @@ class FoldedRollout(nn.Module):
         if self.moving:
             gradient = gradient + x * both[..., :1]
         return self.policy.cost.policy(self.policy.model.effectiveness(x), gradient)
+
+
+def searches(module: nn.Module) -> TypeGuard[FilteredPolicy | SupervisedPolicy]:
+    """Return whether a policy is around one that searches a memory, which no program of a row does."""
+    if not isinstance(module, FilteredPolicy | SupervisedPolicy):
+        return False
+    return isinstance(module.policy, RememberedPolicy) or searches(module.policy)
 
 
 def foldable(policy: RolloutPolicy) -> bool:

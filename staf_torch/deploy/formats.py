@@ -17,9 +17,10 @@ from torch import Tensor, nn
 from torch.export import ExportedProgram
 
 from ..numerics.checks import fail, integer, trailing
+from .counted import Source
 from .graph import trace
 from .names import check_count, check_dtype, function_name, listed_names
-from .onnx_loops import in_loops, renamed, with_loops
+from .onnx_loops import in_loops, renamed
 
 FORMAT = 1
 """Of the note inside a .pt2 file; raised when an older reader would go wrong."""
@@ -65,7 +66,7 @@ def export_onnx(
     example: Tensor | None = None,
     batch: int | None = None,
     name: str | None = None,
-) -> None:
+) -> Source | None:
     """Write a module, or a program of `trace`, as an ONNX model.
 
     A module whose loops a row program keeps (a rollout, a filter) is written in a second, with ONNX's Loop in
@@ -90,6 +91,9 @@ def export_onnx(
         example: of a module: an input, (B, n), in its dtype.
         batch: of a module: rows of every call; any by default.
         name: of the graph; that of the policy by default.
+
+    Returns:
+        The cost of a call where loops are kept, None elsewhere: `trace` has the operations.
 
     Raises:
         ValueError: if the extra ``onnx`` is not installed, a name is there twice, the number of names is
@@ -116,13 +120,14 @@ def export_onnx(
         if batch is not None:
             integer("export_onnx", "batch", batch, least=1)
         check_dtype("export_onnx", module, example)
-        traced = with_loops(module, example)
-        if traced is None:
-            model = _unrolled(trace(module, example, batch=batch), names)
-        else:
-            model = in_loops(traced, names, example.shape[-1], batch, name)
+        written = in_loops(module, example, names, batch, name)
+        if written is not None:
+            path.write_bytes(written.model.SerializeToString())
+            return written.source
+        model = _unrolled(trace(module, example, batch=batch), names)
     model.graph.name = name
     path.write_bytes(model.SerializeToString())
+    return None
 
 
 def _named(argument: str, names: Sequence[str]) -> list[str]:

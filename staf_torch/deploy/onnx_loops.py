@@ -9,7 +9,7 @@ Unrolled tensor operations, as `torch.onnx` writes them, take minutes of tracing
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -18,10 +18,12 @@ from torch import Tensor, nn
 from ..lanes.call import Given
 from ..lanes.emit.schedule import Schedule
 from ..lanes.row_independence import doubt
-from ..lanes.trace.graph import FLAG, NARROW, ROW, STEP, WIDE, Graph
-from ..lanes.trace.step import Traced, trace
+from ..lanes.trace.graph import FLAG, NARROW, ROW, STEP, WIDE
+from ..lanes.trace.step import Step, Traced, trace
 from ..lanes.trace.tracer import NotLoweredError
 from ..lanes.tree import Tree
+from .controllers import FilteredPolicy, searches
+from .counted import Source, counted
 from .names import check_count
 from .remembered import RememberedPolicy
 
@@ -33,44 +35,45 @@ _UNARY |= {"tanh": "Tanh", "floor": "Floor", "ceil": "Ceil", "round": "Round", "
 _OF_LOOPS = ("loop", "result", "results", "collect", "carry", "carrys")
 
 
-def with_loops(module: nn.Module, example: Tensor) -> Traced | None:
-    """Return the trace of a module that has loops; None where it has none, or rows that are not alone.
+class Written(NamedTuple):
+    """A model, and the cost of a call for a row."""
+
+    model: Any
+    source: Source
+
+
+def in_loops(
+    module: nn.Module, example: Tensor, names: Sequence[str], batch: int | None, name: str
+) -> Written | None:
+    """Return a module with loops as an ONNX model; None where it has none, or rows that are not alone.
 
     Args:
         module: (B, n) -> a tensor or a tuple of tensors (B,) and (B, m).
         example: an input, (B, n).
-    """
-
-    def step(carry: Tree, _: Tree, row: Tree) -> tuple[Tree, Tree]:
-        out = module(row["state"])
-        return carry, (out,) if isinstance(out, Tensor) else tuple(out)
-
-    if isinstance(module, RememberedPolicy):
-        return None
-    given = Given.of((), (), {"state": example[:1].detach().expand(2, -1).contiguous()}, 1)
-    with torch.no_grad():
-        try:
-            traced = trace(step, given, folded=True)
-        except NotLoweredError:
-            return None
-        plain = all(len(shape) < 2 and dtype == example.dtype for shape, dtype in traced.outputs)
-        return traced if plain and traced.program[0].loops and doubt(step, given) is None else None
-
-
-def in_loops(traced: Traced, names: Sequence[str], size: int, batch: int | None, name: str) -> Any:
-    """Return the ONNX model of a trace of `with_loops`.
-
-    Args:
-        traced: of one row.
         names: of the input and the outputs.
-        size: entries of the input.
         batch: rows; None for any.
         name: of the graph.
     """
-    check_count("export_onnx", names[1:], len(traced.outputs))
-    graph, _, _, ends = traced.program
-    sizes = [shape[0] if shape else None for shape, _ in traced.outputs]
-    return OnnxGraph(graph, ends, sizes, size, names, batch).model(name)
+    writer = OnnxWriter(np.dtype(np.float32 if example.dtype == torch.float32 else np.float64), names[0])
+    with torch.no_grad():
+        found = writer.policy(module, example[:1].detach(), names[0])
+    if found is None:
+        return None
+    check_count("export_onnx", names[1:], len(found))
+    return Written(writer.model(name, names, found, example.shape[-1], batch), writer.source)
+
+
+def traced_row(step: Step, row: Mapping[str, Tensor]) -> Traced | None:
+    """Return the trace of a step of a row without a carry, (1, ...); None where it has no scalar form."""
+    two = {key: part.expand(2, *part.shape[1:]).contiguous() for key, part in row.items()}
+    given = Given.of((), (), two, 1)
+    try:
+        traced = trace(step, given, folded=True)
+    except NotLoweredError:
+        return None
+    real = next(iter(row.values())).dtype
+    plain = all(len(shape) < 2 and dtype == real for shape, dtype in traced.outputs)
+    return traced if plain and doubt(step, given) is None else None
 
 
 def renamed(model: Any, names: Mapping[str, str]) -> Any:
@@ -96,64 +99,165 @@ def renamed(model: Any, names: Mapping[str, str]) -> Any:
     return model
 
 
-class OnnxGraph:
-    """An ONNX model of a traced program of one row without a carry and with one input.
+class OnnxWriter:
+    """An ONNX graph that grows by programs of one row, and by what policies with tables do between them.
 
     Args:
-        graph: of the trace.
-        outputs: its nodes, of all outputs one after the other.
-        sizes: entries of every output, None for a number.
-        size: entries of the input.
-        names: of the input and the outputs.
-        batch: rows; None for any.
+        real: dtype of the numbers.
+        first: the input, which has all rows.
+
+    Attributes:
+        source: what a call costs for a row.
     """
 
-    def __init__(
-        self,
-        graph: Graph,
-        outputs: Sequence[int],
-        sizes: Sequence[int | None],
-        size: int,
-        names: Sequence[str],
-        batch: int | None,
-    ) -> None:
+    def __init__(self, real: Any, first: str) -> None:
         import onnx
 
-        self.onnx, self.graph, self.schedule = onnx, graph, Schedule(graph, [], outputs)
-        self.real = np.dtype(np.float32 if graph.single else np.float64)
-        self.names, self.sizes, self.size, self.batch = names, sizes, size, batch
-        self.roots = list(outputs)
+        self.onnx, self.real = onnx, real
         self.constants: dict[Any, str] = {}
         self.initializers: list[Any] = []
         self.scopes: list[tuple[list[Any], dict[int, str]]] = [([], {})]  # statements, and names of nodes
         self.single: set[str] = set()  # values of one row, whatever the batch
         self.count = 0
-        self.results: dict[tuple[str, int, int], str] = {}  # of loops that are written
+        self.source = Source(0, 0, 0)
+        self.rows = self._rows_of(first)
 
-    def model(self, name: str) -> Any:
-        """Return the model, under a name."""
-        make = self.onnx.helper
-        self._emit("Shape", [self.names[0]], "_rows", end=1)
-        self.rows = self._emit("Concat", ["_rows", self._constant([1], np.int64)], axis=0)
+    def model(
+        self,
+        name: str,
+        names: Sequence[str],
+        found: Sequence[tuple[str, int | None]],
+        size: int,
+        batch: int | None,
+    ) -> Any:
+        """Return the model, under a name, of values (B, ...) and their entries, None for a number a row."""
+        make, rows = self.onnx.helper, "batch" if batch is None else batch
+        kind, ends = make.np_dtype_to_tensor_dtype(self.real), []
+        for output, (value, entries) in zip(names[1:], found, strict=True):
+            if entries is None:
+                self._emit("Squeeze", [value, self._constant([1], np.int64)], output)
+            else:
+                self._emit("Identity", [value], output)
+            shape = [rows] if entries is None else [rows, entries]
+            ends.append(make.make_tensor_value_info(output, kind, shape))
+        given = make.make_tensor_value_info(names[0], kind, [rows, size])
+        whole = make.make_graph(self.scopes[0][0], name, [given], ends, initializer=self.initializers)
+        opset = make.make_opsetid("", _OPSET)
+        found_model = make.make_model(whole, opset_imports=[opset], producer_name="staf_torch")
+        found_model.ir_version = _IR
+        return found_model
+
+    # Policies.
+
+    def policy(self, module: nn.Module, x: Tensor, state: str) -> list[tuple[str, int | None]] | None:
+        """Write a policy that has loops; None, and nothing written, for any other.
+
+        Args:
+            module: as in `in_loops`.
+            x: an input, (1, n).
+            state: the name of the input.
+        """
+        if isinstance(module, RememberedPolicy):
+            return [(self._remembered(module, x, state), module.problem.inputs)]
+        if searches(module):
+            inner = x[:, : module.plant_size] if isinstance(module, FilteredPolicy) else x
+            first = state if inner.shape == x.shape else self._take(state, range(inner.shape[-1]))
+            wanted = self.policy(module.policy, inner, first)
+            u = module.policy(inner)
+            traced = traced_row(
+                lambda c, _, row: (c, (module.restrained(row["x"], row["u"]),)), {"x": x, "u": u}
+            )
+            if wanted is None or traced is None:
+                return None
+            return self.program(traced, [state, wanted[0][0]])
+
+        def step(carry: Tree, _: Tree, row: Tree) -> tuple[Tree, Tree]:
+            out = module(row["state"])
+            return carry, (out,) if isinstance(out, Tensor) else tuple(out)
+
+        traced = traced_row(step, {"state": x})
+        return None if traced is None or not traced.program[0].loops else self.program(traced, [state])
+
+    def _remembered(self, module: RememberedPolicy, x: Tensor, state: str) -> str:
+        """Write the search for the nearest plans, and a loop that follows each."""
+        whole, count, states = np.int64, module.candidates + 1, len(module.first) - 1
+
+        def seen(carry: Tree, _: Tree, row: Tree) -> tuple[Tree, Tree]:
+            return carry, (module.seen(row["x"]),)
+
+        place, follow = traced_row(seen, {"x": x}), traced_row(module.program().step, module.row(x))
+        assert place is not None
+        assert follow is not None
+        ((at, _),) = self.program(place, [state])
+        apart = self._emit("Sub", [self._unsqueezed(at, 1), self._table(module.searched)])
+        far = self._emit(
+            "ReduceSum", [self._emit("Mul", [apart, apart]), self._constant([2], whole)], keepdims=0
+        )
+        _, near = self._several("TopK", [far, self._constant([module.candidates], whole)], 2, largest=0)
+        near = self._emit("Mod", [near, self._constant([[states]], whole)])
+        resting = self._full(self._constant([[states]], whole))
+        chosen = self._reshaped(self._emit("Concat", [near, resting], axis=1), -1)
+        first, last, end = (
+            self._emit("Gather", [self._table(part), chosen])
+            for part in (module.first, module.last, module.end)
+        )
+        ahead = self._emit(
+            "Add", [self._unsqueezed(first, 1), self._constant([range(module.lookahead)], whole)]
+        )
+        steps = self._emit("Min", [ahead, self._unsqueezed(last, 1)])
+        width = module.lookahead * module.plans.shape[1]
+        window = self._reshaped(self._emit("Gather", [self._table(module.plans), steps]), -1, width)
+        size = self._constant([1, count, 1], whole)
+        spread = self._reshaped(self._emit("Expand", [self._unsqueezed(state, 1), size]), -1, x.shape[-1])
+        ends = self._emit("Gather", [self._table(module.models), end])
+        rows, self.rows = self.rows, self._rows_of(spread)
+        before = self.source
+        (cost, _), (control, m) = self.program(follow, [spread, window, ends])
+        one = Source(*(b - a for a, b in zip(before, self.source, strict=True)))
+        self.rows = rows
+        self.source = Source(*(a + b for a, b in zip(before, module.source(one), strict=True)))
+        best = self._emit("ArgMin", [self._reshaped(cost, -1, count)], axis=1, keepdims=1)
+        wide = self._emit("Expand", [self._unsqueezed(best, 2), self._constant([1, 1, m], whole)])
+        found = self._emit("GatherElements", [self._reshaped(control, -1, count, m), wide], axis=1)
+        return self._emit("Squeeze", [found, self._constant([1], whole)])
+
+    def program(self, traced: Traced, inputs: Sequence[str]) -> list[tuple[str, int | None]]:
+        """Write a program of a row: the names of its outputs (B, size), and their entries."""
+        graph, _, _, ends = traced.program
+        self.graph, self.schedule, self.inputs = graph, Schedule(graph, [], ends), inputs
+        self.results: dict[tuple[str, int, int], str] = {}  # of loops that are written
+        self.part = self._new("part")
+        self.scopes[0][1].clear()
         for node in (*self.schedule.block(ROW), *self.schedule.block(STEP)):
             self._statement(node)
-        nodes, ends = iter(self.roots), []
-        kind = make.np_dtype_to_tensor_dtype(self.real)
-        rows = "batch" if self.batch is None else self.batch
-        for output, size in zip(self.names[1:], self.sizes, strict=True):
-            parts = [self._put(next(nodes)) for _ in range(size or 1)]
-            if size is None:
-                self._emit("Squeeze", [parts[0], self._constant([1], np.int64)], output)
-            else:
-                self._emit("Concat", parts, output, axis=1)
-            ends.append(make.make_tensor_value_info(output, kind, [rows] if size is None else [rows, size]))
-        given = make.make_tensor_value_info(self.names[0], kind, [rows, self.size])
-        whole = make.make_graph(self.scopes[0][0], name, [given], ends, initializer=self.initializers)
-        found = make.make_model(
-            whole, opset_imports=[make.make_opsetid("", _OPSET)], producer_name="staf_torch"
-        )
-        found.ir_version = _IR
+        nodes, found = iter(ends), list[tuple[str, int | None]]()
+        for shape, _ in traced.outputs:
+            parts = [self._put(next(nodes)) for _ in range(shape[0] if shape else 1)]
+            found.append((self._emit("Concat", parts, axis=1), shape[0] if shape else None))
+        self.source = Source(*(a + b for a, b in zip(self.source, counted(traced), strict=True)))
         return found
+
+    def _rows_of(self, value: str) -> str:
+        """Return the shape (B, 1)."""
+        count = self._emit("Shape", [value], end=1)
+        return self._emit("Concat", [count, self._constant([1], np.int64)], axis=0)
+
+    def _table(self, values: Tensor) -> str:
+        """Return a table, as it is."""
+        name = self._constant(values.numpy(), values.numpy().dtype)
+        self.single.discard(name)
+        return name
+
+    def _unsqueezed(self, value: str, axis: int) -> str:
+        return self._emit("Unsqueeze", [value, self._constant([axis], np.int64)])
+
+    def _reshaped(self, value: str, *shape: int) -> str:
+        return self._emit("Reshape", [value, self._constant(shape, np.int64)])
+
+    def _several(self, op: str, inputs: Sequence[str], count: int, **attributes: Any) -> list[str]:
+        names = [self._new(op) for _ in range(count)]
+        self.scopes[-1][0].append(self.onnx.helper.make_node(op, list(inputs), names, **attributes))
+        return names
 
     def _put(self, node: int) -> str:
         """Return a number of an output, with all rows and in the dtype of the program."""
@@ -217,7 +321,7 @@ class OnnxGraph:
         if op == "const":
             return self._constant([[graph.value(node)]], self._dtype(node))
         if op == "row":
-            return self._take(self.names[0], [aux[1]])
+            return self._take(self.inputs[aux[0]], [aux[1]])
         if op == "elem":
             return self._take(self._ref(graph.args[node][0]), [aux])
         if op == "pack":
@@ -226,7 +330,7 @@ class OnnxGraph:
             number, at, stride = aux
             step = self._constant(stride, np.int64)
             place = self._emit(
-                "Add", [self._emit("Mul", [f"_i{number}", step]), self._constant(at, np.int64)]
+                "Add", [self._emit("Mul", [f"_i{self.part}_{number}", step]), self._constant(at, np.int64)]
             )
             array = self._ref(graph.args[node][0])
             found = self._emit(
@@ -373,7 +477,7 @@ class OnnxGraph:
         make, loop = self.onnx.helper, self.graph.loops[number]
         live, kept = sorted(self.schedule.carries.get(number, ())), sorted(self.schedule.collected(number))
         initial = [self._full(self._ref(loop.initial[k])) for k in live]
-        names = [f"_l{number}_{k}" for k in live]
+        names = [f"_l{self.part}_{number}_{k}" for k in live]
         self.scopes.append(([], {loop.carry[k]: name for k, name in zip(live, names, strict=True)}))
         for node in self.schedule.body(number):
             self._statement(node)
@@ -382,8 +486,8 @@ class OnnxGraph:
         put = [self._emit("Identity", [self._full(self._packed(loop.collected[k]))]) for k in kept]
         statements, _ = self.scopes.pop()
         flag, index = self.onnx.TensorProto.BOOL, self.onnx.TensorProto.INT64
-        begins = [make.make_tensor_value_info(f"_i{number}", index, [])]
-        begins.append(make.make_tensor_value_info(f"_g{number}", flag, []))
+        begins = [make.make_tensor_value_info(f"_i{self.part}_{number}", index, [])]
+        begins.append(make.make_tensor_value_info(f"_g{self.part}_{number}", flag, []))
         begins += [self._info(name, loop.carry[k]) for name, k in zip(names, live, strict=True)]
         ends = [make.make_tensor_value_info(going, flag, [])]
         ends += [self._info(name, loop.carry[k]) for name, k in zip(after, live, strict=True)]
@@ -391,8 +495,11 @@ class OnnxGraph:
             self._info(name, loop.collected[k][0], len(loop.collected[k]))
             for name, k in zip(put, kept, strict=True)
         ]
-        body = make.make_graph(statements, f"loop_{number}", begins, ends)
-        results, stacked = [f"_r{number}_{k}" for k in live], [f"_y{number}_{k}" for k in kept]
+        body = make.make_graph(statements, f"loop{self.part}_{number}", begins, ends)
+        results, stacked = (
+            [f"_r{self.part}_{number}_{k}" for k in live],
+            [f"_y{self.part}_{number}_{k}" for k in kept],
+        )
         given = [self._constant(loop.count, np.int64), self._constant(True, bool), *initial]
         self.scopes[-1][0].append(make.make_node("Loop", given, [*results, *stacked], body=body))
         self.results |= {("result", number, k): name for k, name in zip(live, results, strict=True)}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
@@ -12,10 +11,9 @@ from torch import Tensor, nn
 from ..adp import GlobalValue
 from ..adp.planning.global_value import follow_plan
 from ..lanes import Program
-from ..lanes.emit.c import commented
-from ..lanes.emit.identifiers import guarded
 from ..lanes.tree import Tree
 from ..numerics.checks import hold
+from .counted import Source
 
 
 class RememberedPolicy(nn.Module):
@@ -73,8 +71,7 @@ class RememberedPolicy(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """u: (B, n) -> (B, m)."""
         count, states = self.candidates + 1, len(self.first) - 1
-        seen = self.problem.offset(x, self.problem.goal) @ self.frame
-        apart = (seen.unsqueeze(1) - self.searched).square().sum(-1)  # (B, S)
+        apart = (self.seen(x).unsqueeze(1) - self.searched).square().sum(-1)  # (B, S)
         near = apart.topk(self.candidates, largest=False).indices % states
         at = torch.cat((near, torch.full_like(near[:, :1], states)), dim=1).flatten()
         ahead = self.first[at].unsqueeze(1) + torch.arange(self.lookahead)
@@ -86,6 +83,18 @@ class RememberedPolicy(nn.Module):
         u = control.unflatten(0, (-1, count)).gather(1, best[..., None].expand(-1, -1, control.shape[-1]))
         chosen: Tensor = u.squeeze(1)
         return chosen
+
+    def seen(self, x: Tensor) -> Tensor:
+        """Return states in the coordinates of the search, (B, n)."""
+        offset: Tensor = self.problem.offset(x, self.problem.goal.to(x)) @ self.frame
+        return offset
+
+    def source(self, one: Source) -> Source:
+        """Return the cost of a call, where following a candidate costs ``one``."""
+        plans, (searched, n) = self.candidates + 1, self.searched.shape
+        compared = searched * (3 * n + 1) + n * (2 * n + 4)
+        tables = sum(getattr(self, name).numel() for name in ("plans", "models", "searched"))
+        return Source(tables + one.constants, plans * one.flops + compared, plans * one.functions)
 
     def program(self) -> Program:
         """Evaluate a candidate from a state, (1, n), as a row program."""
@@ -101,8 +110,8 @@ class RememberedPolicy(nn.Module):
         window = self.plans[self.first[:1].expand(self.lookahead)].unsqueeze(0)
         return {"x": x, "window": window, "end": self.models[:1]}
 
-    def c_text(self, name: str, follow: str, outputs: Sequence[str], note: str) -> str:
-        """The header: tables, the text ``follow`` of `program` as ``NAME_follow``, and the search."""
+    def c_text(self, name: str, follow: str, output: str) -> str:
+        """Return a header's text: tables, ``follow`` of `program` as ``NAME_follow``, and the search."""
         real = "float" if self.plans.dtype == torch.float32 else "double"
         n, m = self.problem.dim, self.problem.inputs
         floats = ("plans", "models", "searched", "frame")
@@ -119,14 +128,14 @@ class RememberedPolicy(nn.Module):
                 "MODEL": self.models.shape[1],
             },
             **{"S": len(self.searched), "J": len(self.first) - 1, "K": self.candidates, "H": self.lookahead},
-            **{"ROUND": "rintf" if real == "float" else "rint", "CONTROL": outputs[0]},
+            **{"ROUND": "rintf" if real == "float" else "rint", "CONTROL": output},
             "GOAL": ", ".join(repr(float(g)) for g in self.problem.goal),
             "PERIOD": ", ".join(repr(2 * math.pi) if i in self.problem.periodic else "0" for i in range(n)),
         }
         text = _SEARCH
         for each, value in sizes.items():
             text = text.replace(f"@{each}@", str(value))
-        return commented(note) + guarded(name, "\n".join([follow.strip(), "", *tables, text]))
+        return "\n".join([follow.strip(), "", *tables, text])
 
 
 def _table(kind: str, name: str, table: Tensor, single: bool) -> str:
@@ -137,38 +146,42 @@ def _table(kind: str, name: str, table: Tensor, single: bool) -> str:
 
 _SEARCH = """static inline void @NAME@(const @REAL@ state[@N@], @REAL@ @CONTROL@[@M@])
 {
-    static const @REAL@ goal[@N@] = { @GOAL@ }, period[@N@] = { @PERIOD@ }; /* 0: no angle */
-    @REAL@ at[@N@] = { 0 }, far[@K@], least = (@REAL@)INFINITY;
-    int near[@K@ + 1];
-    for (int i = 0; i < @N@; ++i) {
-        @REAL@ away = state[i] - goal[i];
-        if (period[i] > 0) away -= @ROUND@(away / period[i]) * period[i];
-        for (int k = 0; k < @N@; ++k) at[k] += away * @NAME@_frame[i * @N@ + k];
+    static const @REAL@ own_goal[@N@] = { @GOAL@ }, own_period[@N@] = { @PERIOD@ }; /* 0: no angle */
+    @REAL@ own_at[@N@] = { 0 }, own_far[@K@], own_least = (@REAL@)INFINITY;
+    int own_near[@K@ + 1];
+    for (int i0 = 0; i0 < @N@; ++i0) {
+        @REAL@ own_away = state[i0] - own_goal[i0];
+        if (own_period[i0] > 0) own_away -= @ROUND@(own_away / own_period[i0]) * own_period[i0];
+        for (int i2 = 0; i2 < @N@; ++i2) own_at[i2] += own_away * @NAME@_frame[i0 * @N@ + i2];
     }
-    for (int k = 0; k < @K@; ++k) far[k] = (@REAL@)INFINITY, near[k] = k;
-    near[@K@] = @J@; /* the goal's own feedback */
-    for (int j = 0; j < @S@; ++j) { /* the @K@ nearest, the nearest first */
-        @REAL@ square = 0;
-        for (int i = 0; i < @N@; ++i) {
-            const @REAL@ apart = at[i] - @NAME@_searched[j * @N@ + i];
-            square += apart * apart;
+    for (int i2 = 0; i2 < @K@; ++i2) own_far[i2] = (@REAL@)INFINITY, own_near[i2] = i2;
+    own_near[@K@] = @J@; /* the goal's own feedback */
+    for (int i1 = 0; i1 < @S@; ++i1) { /* the @K@ nearest, the nearest first */
+        @REAL@ own_square = 0;
+        for (int i0 = 0; i0 < @N@; ++i0) {
+            const @REAL@ own_apart = own_at[i0] - @NAME@_searched[i1 * @N@ + i0];
+            own_square += own_apart * own_apart;
         }
-        if (!(square < far[@K@ - 1])) continue;
-        int k = @K@ - 1;
-        for (; k > 0 && square < far[k - 1]; --k) far[k] = far[k - 1], near[k] = near[k - 1];
-        far[k] = square, near[k] = j % @J@; /* an image stands for its state */
+        if (!(own_square < own_far[@K@ - 1])) continue;
+        int i2 = @K@ - 1;
+        for (; i2 > 0 && own_square < own_far[i2 - 1]; --i2) {
+            own_far[i2] = own_far[i2 - 1];
+            own_near[i2] = own_near[i2 - 1];
+        }
+        own_far[i2] = own_square, own_near[i2] = i1 % @J@; /* an image stands for its state */
     }
-    for (int k = 0; k <= @K@; ++k) {
-        @REAL@ window[@H@ * @WIDTH@], cost[1], control[@M@];
-        const int j = near[k];
-        for (int t = 0; t < @H@; ++t) {
-            const int row = @NAME@_first[j] + t < @NAME@_last[j] ? @NAME@_first[j] + t : @NAME@_last[j];
-            for (int i = 0; i < @WIDTH@; ++i) window[t * @WIDTH@ + i] = @NAME@_plans[row * @WIDTH@ + i];
+    for (int i2 = 0; i2 <= @K@; ++i2) {
+        @REAL@ own_window[@H@ * @WIDTH@], own_cost[1], own_control[@M@];
+        const int i1 = own_near[i2];
+        for (int t0 = 0; t0 < @H@; ++t0) {
+            const int own_end = @NAME@_last[i1], own_next = @NAME@_first[i1] + t0;
+            const @REAL@ *own_plan = @NAME@_plans + (own_next < own_end ? own_next : own_end) * @WIDTH@;
+            for (int i0 = 0; i0 < @WIDTH@; ++i0) own_window[t0 * @WIDTH@ + i0] = own_plan[i0];
         }
-        @NAME@_follow(state, window, @NAME@_models + @NAME@_end[j] * @MODEL@, cost, control);
-        if (k > 0 && !(cost[0] < least)) continue;
-        least = cost[0];
-        for (int i = 0; i < @M@; ++i) @CONTROL@[i] = control[i];
+        @NAME@_follow(state, own_window, @NAME@_models + @NAME@_end[i1] * @MODEL@, own_cost, own_control);
+        if (i2 > 0 && !(own_cost[0] < own_least)) continue;
+        own_least = own_cost[0];
+        for (int i0 = 0; i0 < @M@; ++i0) @CONTROL@[i0] = own_control[i0];
     }
 }
 """

@@ -167,6 +167,35 @@ def test_a_learner_sees_the_states_and_random_numbers_of_its_run(row: int, runs:
     assert plain.uniform.shape == (10, 0, 2)
 
 
+@needs_cc
+def test_near_optimal_with_bounds_is_exported_with_its_plan_or_as_a_function_of_x(tmp_path: Path) -> None:
+    chosen = [
+        "adp/policy=near_optimal",
+        "adp.policy.reach=local",
+        "adp.policy.horizon=0.2",
+        "system=pendulum",
+    ]
+    size = ["+adp.cost.low=-3", "+adp.cost.high=3", "initial_state=[0.5,0.0]", "dt=0.05", "duration=0.2"]
+    cfg, run = settings("experiment=adp", "figures=false", *chosen, *size), tmp_path / "class"
+    (run / ".hydra").mkdir(parents=True)
+    OmegaConf.save(cfg, run / ".hydra" / "config.yaml")
+    with lanes.compiling("never"):
+        experiment(cfg.task)(cfg, run)
+        with pytest.raises(ValueError, match=r"carries a plan .*`--to c` writes it .*`--function`"):
+            export(run, "pt2")
+        plans = learning(run)  # what `--to c` writes: tests/deploy/test_plans_in_c.py has a header of it
+        page = export(run, "c", function=True, calls=20)
+    assert not plans.learns
+    assert plans.what.endswith("and the plan from there on.")
+    assert "without the plans" in page["what"]
+    assert page["name"] == "class_run"  # class is no name in C++
+    assert "void class_run(const double state[2], double" in (run / "export" / "controller.h").read_text()
+    with pytest.raises(
+        ValueError, match=r"`staf-export\(name=...\)` must be free names of C and C\+\+; got 'new'"
+    ):
+        export(run, "c", name="new")
+
+
 # Refusals
 
 
