@@ -35,7 +35,7 @@ _UNARY |= {"tanh": "Tanh", "floor": "Floor", "ceil": "Ceil", "round": "Round", "
 _OF_LOOPS = ("loop", "result", "results", "collect", "carry", "carrys")
 
 
-class Written(NamedTuple):
+class OnnxFile(NamedTuple):
     """A model, and the cost of a call for a row."""
 
     model: Any
@@ -44,7 +44,7 @@ class Written(NamedTuple):
 
 def in_loops(
     module: nn.Module, example: Tensor, names: Sequence[str], batch: int | None, name: str
-) -> Written | None:
+) -> OnnxFile | None:
     """Return a module with loops as an ONNX model; None where it has none, or rows that are not alone.
 
     Args:
@@ -60,7 +60,7 @@ def in_loops(
     if found is None:
         return None
     check_count("export_onnx", names[1:], len(found))
-    return Written(writer.model(name, names, found, example.shape[-1], batch), writer.source)
+    return OnnxFile(writer.model(name, names, found, example.shape[-1], batch), writer.source)
 
 
 def traced_row(step: Step, row: Mapping[str, Tensor]) -> Traced | None:
@@ -212,7 +212,8 @@ class OnnxWriter:
         ends = self._emit("Gather", [self._table(module.models), end])
         rows, self.rows = self.rows, self._rows_of(spread)
         before = self.source
-        (cost, _), (control, m) = self.program(follow, [spread, window, ends])
+        m = module.problem.inputs
+        (cost, _), (control, _) = self.program(follow, [spread, window, ends])
         one = Source(*(b - a for a, b in zip(before, self.source, strict=True)))
         self.rows = rows
         self.source = Source(*(a + b for a, b in zip(before, module.source(one), strict=True)))
