@@ -150,7 +150,7 @@ def exponential_stages(
 class StepCount(NamedTuple):
     """A number of steps and the relative error that is left with it."""
 
-    count: int
+    number: int
     error: float
 
 

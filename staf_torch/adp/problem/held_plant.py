@@ -278,17 +278,17 @@ class Holding:
             dear = StepCount(_MOST, math.inf)
             if linear is not None:
                 dear = fewest_steps(errors(linear), TOLERANCE, _MOST)
-            most = _MOST if dear.error > TOLERANCE else min(_MOST, math.ceil(_DEARER * dear.count))
+            most = _MOST if dear.error > TOLERANCE else min(_MOST, math.ceil(_DEARER * dear.number))
             found = fewest_steps(errors(None), TOLERANCE, most)
-            cheaper = found.error <= TOLERANCE and found.count <= _DEARER * dear.count
+            cheaper = found.error <= TOLERANCE and found.number <= _DEARER * dear.number
             if not cheaper and dear.error < found.error:
-                found, self.table = dear, self._with(dear.count, linear).table
-        self.least, self.steps, self.error = found.count, found.count, found.error
-        if not found.error <= (_OUTSIDE if found.count == 1 and self.table is None else GRACE) * TOLERANCE:
+                found, self.table = dear, self._with(dear.number, linear).table
+        self.least, self.steps, self.error = found.number, found.number, found.error
+        if not found.error <= (_OUTSIDE if found.number == 1 and self.table is None else GRACE) * TOLERANCE:
             _log.warning(
                 "%s: with %d integration steps a period of %.4g s the next state is wrong by %.2g of its "
                 "size (wanted: %.0e): the rate is too fast for this dt, or has corners.",
-                *(self.call, found.count, self.dt, found.error, TOLERANCE),
+                *(self.call, found.number, self.dt, found.error, TOLERANCE),
             )
 
     def _with(self, count: int, linear: Tensor | None) -> Holding:
@@ -328,8 +328,8 @@ class Holding:
         return self.cost.target
 
     def _linearisation(self) -> Tensor | None:
-        at = None if self.cost is None else self.cost.target
-        found = self.plant.linearisation(at, None if at is None else self.cost.target_input).matrix.double()
+        at, u = (None, None) if self.cost is None else (self.cost.target, self.cost.target_input)
+        found = self.plant.linearisation(at, None if at is None else u).matrix.double()
         return found if bool(torch.isfinite(found).all()) else None
 
     def _samples(self) -> tuple[Tensor, Tensor]:
