@@ -301,7 +301,7 @@ class LocalFilter:
         learned = old.learned * share + gain.unsqueeze(1) * (gain / spread)
         errors, surprises = self._errors(old, away, before.weight.nan_to_num(0.0))
         level, deviation, leaps, told = spread_with(
-            y, old.level, old.spread, self._spread(old), old.leaps, old.told
+            y, old.level, old.spread, self._spread(old), old.leaps, old.told, since
         )
         # a sample that repeats the last one says nothing of errors, unless all have been alike
         says = seen & ~(stays & torch.eq(y, old.value) & (old.told >= 2))
@@ -340,7 +340,7 @@ class LocalFilter:
 
 
 def spread_with(
-    y: Tensor, level: Tensor, spread: Tensor, size: Tensor, leaps: Tensor, told: Tensor
+    y: Tensor, level: Tensor, spread: Tensor, size: Tensor, leaps: Tensor, told: Tensor, age: Tensor
 ) -> tuple[Tensor, ...]:
     """The running mean and deviation of y with another value.
 
@@ -353,12 +353,13 @@ def spread_with(
         size: that deviation, or another one where y has been constant.
         leaps: values in a row that were far away.
         told: values so far.
+        age: samples so far; of some, a first other value may be an outlier.
 
     Returns:
         The next level, spread, leaps and told.
     """
     rate = torch.minimum(3 / (told + 3), 1 / (told - 40).clamp(min=1.0)).clamp(min=SPREAD_RATE)
-    step, leaps = _limited((y - level).abs(), size, leaps, told)
+    step, leaps = _limited((y - level).abs(), size, leaps, torch.where(told > 0, age, 0.0))
     wide = (1 - rate).sqrt() * torch.hypot(spread, rate.sqrt() * step)
     counts = (wide > 0) | (told == 0)
     told = torch.where(counts, (told + 1).clamp(max=2 / SPREAD_RATE), told)

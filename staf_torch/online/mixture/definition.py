@@ -348,7 +348,9 @@ class BankDefinition:
     def _learn_spread(self, s: Views, y: Tensor, known: Tensor) -> None:
         """The running mean and spread of y, as the filter's."""
         spread = torch.where(constant(s), 1.0, s["wide"])
-        level, wide, leaps, told = spread_with(y, s["level"], s["wide"], spread, s["leaps"], s["told"])
+        level, wide, leaps, told = spread_with(
+            y, s["level"], s["wide"], spread, s["leaps"], s["told"], s["clock"]
+        )
         for name, new in (("level", level), ("wide", wide), ("leaps", leaps), ("told", told)):
             s[name].copy_(torch.where(known, new, s[name]))
 

@@ -295,7 +295,7 @@ static void keep(const Rules &r, Stream &s, const double *x, const double *y, do
 static void learn_spread(Stream &s, int o, double y) {
     const double told = s.told[o], spread = constant(s, o) ? 1 : s.wide[o], step = std::sqrt(surprise);
     double size = std::fabs(y - s.level[o]);
-    const bool large = told >= streak_limit + 2 && size > step * spread;
+    const bool large = told > 0 && s.clock >= streak_limit + 2 && size > step * spread;
     if (large) size = std::min(size, std::pow(step, 1 + s.leaps[o]) * spread);
     s.leaps[o] = large ? std::min(s.leaps[o] + 1, 100.) : 0;
     const double rate = std::max(std::min(3 / (told + 3), 1 / std::max(told - 40, 1.)), spread_rate);

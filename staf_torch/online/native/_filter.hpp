@@ -290,7 +290,7 @@ INLINE void learn_scales(const Law &law, Filter &s, int o, V y, V away, V weight
     const V errors = minimum(hypotenuse(kept * s.errors[o], taken * size), all(law.most));
     s.errors[o] = good ? (told >= 2. ? errors : V{}) : s.errors[o];
     s.surprises[o] = good ? surprises : s.surprises[o];
-    const V apart = limited(absolute(y - s.level[o]), spread, told, leaps), step = y < s.level[o] ? -apart : apart;
+    const V apart = limited(absolute(y - s.level[o]), spread, told > 0. ? s.since : V{}, leaps), step = y < s.level[o] ? -apart : apart;
     const V deviation = minimum(fading * hypotenuse(s.spread[o], coming * step), all(law.most));
     const V level = minimum(maximum(s.level[o] + slow * step, all(-law.most)), all(law.most));
     s.told[o] = good & ((deviation > 0.) | (told == 0.)) ? minimum(told + 1., all(2 / spread_rate)) : told;
