@@ -25,7 +25,7 @@ def pendulum(x: Tensor, u: Tensor, row: tuple[Tensor, Tensor]) -> tuple[Tensor, 
         angle, speed = at.unbind(-1)
         return torch.stack((speed, (u - gain * angle.sin()) / mass), dim=-1)
 
-    x = systems.integrators.runge_kutta_step(rate, x, 0.01)
+    x = systems.runge_kutta_step(rate, x, 0.01)
     return x, (x, x[..., 0] > 0)
 
 

@@ -216,9 +216,10 @@ class GlobalValue(nn.Module):
     def nearest(self, x: Tensor, without: Tensor | None = None) -> Tensor:
         """Rows of the memory nearest to x (B, n), and last the resting one: (B, K + 1) int64."""
         count = self.candidates if without is None else min(4 * self.candidates, len(self._rows))
-        seen = self.seen(x)
-        seen = torch.where(torch.isfinite(seen), seen, 0.0)  # such a row finds no value, the others theirs
-        at = self._tree.query(seen.numpy(), count)[1].reshape(len(x), -1)
+        seen = self.seen(x).numpy()
+        if not np.isfinite(seen).all():
+            seen = np.where(np.isfinite(seen), seen, 0.0)  # such a row finds no value, the others theirs
+        at = self._tree.query(seen, count)[1].reshape(len(x), -1)
         rows = self._rows.numpy()[at]
         if without is not None:
             own = rows // self.length == without.numpy()[:, None]
