@@ -9,13 +9,12 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from .compiled_methods import methods_of
-from .plain_time import PlainTime
+from .plain_time import PlainTime, RepaysError
 from .program import Program
 from .row_independence import generators
 from .tree import Tree
 
 _log = logging.getLogger(__name__)
-_GAIN = 2.0  # builds that a loop must take in plain torch before it is compiled
 _FEW = 16  # steps of a loop that are not worth the count of one
 _SAID, _LONG = 1.5, 3.0  # s after which a loop says that it takes long, and that are then left of it at least
 
@@ -58,7 +57,7 @@ class LoopProgram:
             put_back = generators() if not self._done else None
             try:
                 return self._plain(carry, now, row, steps=steps, every=every)
-            except _RepaysError:
+            except RepaysError:
                 assert self._make is not None
                 assert put_back is not None
                 put_back()
@@ -68,10 +67,9 @@ class LoopProgram:
     def _timed(self, carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
         start = time.perf_counter()
         if self._make is not None and not self._done and self._times >= _FEW:
-            with PlainTime() as plain:
+            with PlainTime(self._times) as plain:
                 found = self._step(carry, now, row)
-            if self._times * plain.seconds() >= _GAIN * plain.build:
-                raise _RepaysError
+            plain.refuse()
         else:
             found = self._step(carry, now, row)
         self._look(time.perf_counter() - start)
@@ -96,7 +94,3 @@ class LoopProgram:
             "%s: %d of %d steps took %.1f s in plain torch, the rest takes some %.0f s%s",
             *(self._plain.name, self._done, self._times, self._spent, rest, self._remedy),
         )
-
-
-class _RepaysError(Exception):
-    """All steps of a loop take longer than a compiler."""

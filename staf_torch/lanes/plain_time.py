@@ -18,20 +18,34 @@ from torch.overrides import TorchFunctionMode
 
 _OPERATION, _ENTRY = 5e-6, 2.5e-9  # s
 _TRANSFORMED = 3  # operations more that one takes for each transform of torch.func around it
+GAIN = 2.0
+"""Builds that a loop must take in plain torch before it is compiled."""
+_OFTEN = 256  # operations after which it is asked
 _BUILD, _BUILT_OPERATION = 1.5, 5e-5  # s
+
+
+class RepaysError(Exception):
+    """A loop takes longer in plain torch than a compiler."""
 
 
 class PlainTime(TorchFunctionMode):
     """Context: counts the operations of torch inside of it.
 
+    Args:
+        times: of a loop of which this is one step, to be broken off where all of them repay a compiler; 0
+            for none.
+
     Attributes:
         operations: their number, more for those inside of a transform of torch.func.
         entries: that they made.
+
+    Raises:
+        RepaysError: as soon as the loop is known to take `GAIN` times as long as a compiler.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, times: int = 0) -> None:
         super().__init__()
-        self.operations, self.entries = 0, 0
+        self.operations, self.entries, self._times, self._asked = 0, 0, times, 0
 
     def __torch_function__(
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
@@ -42,7 +56,15 @@ class PlainTime(TorchFunctionMode):
             stack = torch._C._functorch.peek_interpreter_stack()
             self.operations += 1 if stack is None else 1 + _TRANSFORMED * stack.level()
             self.entries += sum([part.numel() for part in made if isinstance(part, Tensor)])
+            if self.operations >= self._asked + _OFTEN:
+                self._asked = self.operations
+                self.refuse()
         return out
+
+    def refuse(self) -> None:
+        """Raise RepaysError if the loop takes longer than a compiler."""
+        if self._times * self.seconds() >= GAIN * self.build:
+            raise RepaysError
 
     def seconds(self, share: float = 1.0) -> float:
         """Return the time in plain torch, with ``share`` times as many entries."""

@@ -31,7 +31,7 @@ TOLERANCE = 1e-6  # error of a hold, relative to the state
 RESOLVED = 0.2  # of the time constant of the fastest mode, that one classical step may take: 3e-6 in error
 GRACE = 10.0  # times the tolerance: more steps are tried, and what is left above it is a warning
 _OUTSIDE = 100.0  # likewise in a few states far out
-_MOST = 1024  # substeps that are chosen at most
+_SOME, _MOST = 64, 1024  # substeps with which most plants stay finite; that are chosen at most
 _SAMPLES, _SHARE = 24, 0.8  # states; the share that one step must serve, as it nearly must all
 _MOVED = 0.1  # of the spread, in a hold, by inputs without bounds
 _DEARER = 1.5  # work of an exponential step, in classical ones
@@ -271,6 +271,8 @@ class Holding:
         usual = float(one.quantile(_SHARE, interpolation="lower")) if len(one) else 0.0
         slow = linear is None or float(torch.linalg.eigvals(linear).abs().max()) * self.dt <= RESOLVED
         if not slow or usual > GRACE * TOLERANCE or found.error > _OUTSIDE * TOLERANCE:
+            stays = self._stays(x, u)
+            x, u = x[stays], u[stays]
             if not (exponential and _adds(self.plant)):
                 linear = None
             elif self.cost is not None:
@@ -290,6 +292,17 @@ class Holding:
                 "size (wanted: %.0e): the rate is too fast for this dt, or has corners.",
                 *(self.call, found.number, self.dt, found.error, TOLERANCE),
             )
+
+    def _stays(self, x: Tensor, u: Tensor) -> Tensor:
+        """Return which holds (P,) the plant itself survives: no number of steps serves a state from which it
+        escapes to infinity within one."""
+        stays = torch.ones(len(x), dtype=torch.bool)
+        for count in (_SOME, _MOST):
+            asked = stays.clone() if count == _SOME else ~stays
+            if bool(asked.any()):
+                after = self._with(count, None)(x[asked], u[asked])[0]
+                stays[asked] = torch.isfinite(after).all(-1)
+        return stays
 
     def _with(self, count: int, linear: Tensor | None) -> Holding:
         """Return a copy with other steps."""

@@ -184,7 +184,7 @@ def test_simulator_that_is_too_slow_for_its_period_is_said_to_be(caplog: pytest.
         return turn(x, u)
 
     with caplog.at_level(logging.WARNING):
-        adp.near_optimal(pendulum(slow, dt=0.01), COST, horizon=0.1)
+        adp.near_optimal(pendulum(slow, dt=0.01), COST, horizon=0.1, reach="local")
     assert "of the 0.01 s for which it is held: it cannot run beside the plant" in caplog.text
     assert "Shorten `horizon` (10 periods now)" in caplog.text
 
