@@ -59,7 +59,7 @@ def trajectory(
     size = total if chunk is None else integer("trajectory", "chunk", chunk, least=1)
     flow = getattr(system, "flow", None)  # a user's module need not have one
 
-    program, none, x = _stepped(system, dt, 1, total, len(x0)), torch.zeros_like(x0[..., 0]), x0
+    program, none, x = _stepped(system, dt, 1, total, len(x0)), torch.full_like(x0[..., 0], torch.nan), x0
     for start in range(0, total, size):
         stop = min(start + size, total)
         time = torch.arange(start, stop, dtype=torch.float64) * dt
@@ -68,6 +68,8 @@ def trajectory(
             yield exact
             continue
         (after, bent, reach), piece = program((x, none, none), steps=stop - start)
+        if bool(bent.isnan().all()):  # by plain torch, which takes as long for all states at once as for one
+            bent, reach = _advanced(system, piece, dt, 1)[1].amax(1), piece.abs().amax(-1).amax(1)
         strained = ~(bent <= _BENT * reach) & torch.isfinite(reach)
         if bool(strained.any()):
             after, piece = _refined(system, dt, x, after, piece, strained.nonzero().squeeze(1))
@@ -76,7 +78,7 @@ def trajectory(
 
 
 Tracked = tuple[Tensor, Tensor, Tensor]
-"""x (B, n), how much the rate bent within a step so far (B,), the largest coordinate so far (B,)."""
+"""x (B, n), how much the rate bent within a step so far (B,), the largest coordinate so far (B,), or NaN."""
 
 
 def _stepped(
@@ -87,15 +89,18 @@ def _stepped(
     def step(now: Tracked, given: Tree, row: Tree) -> tuple[Tracked, Tensor]:
         x, bent, reach = now
         after, more = _advanced(system, x, dt, count)
-        bent = torch.where(more <= bent, bent, more)
-        return (after, bent, torch.maximum(reach, x.abs().amax(-1))), x
+        bent, size = torch.where(more <= bent, bent, more), x.abs().amax(-1)
+        return (after, bent, torch.where(size <= reach, reach, size)), x
+
+    def untracked(now: Tracked, given: Tree, row: Tree) -> tuple[Tracked, Tensor]:
+        return (_advanced(system, now[0], dt, count)[0], *now[1:]), now[0]
 
     def compiled() -> Program:
         return shared_program("a trajectory", step, system, dt, count)
 
     if worth(count * times * (1 + rows / 200) >= _PAYS):
         return compiled()
-    plain = Program(step, name="a trajectory", compile=False)
+    plain = Program(untracked, name="a trajectory", compile=False)
     return LoopProgram(plain, compiled, times) if undecided() else plain
 
 
@@ -103,11 +108,16 @@ def _advanced(system: ControlAffineSystem, x: Tensor, dt: float, count: int) -> 
     """x after dt, and how much the rate bent, h |k_3 - k_2|: (..., n) -> (..., n), (...)."""
     h = dt / count
 
-    def substep(now: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-        _, slopes = runge_kutta_stages(lambda at, share: _drift(system, at), now[0], h)
-        bent = h * (slopes[2] - slopes[1]).abs().amax(-1)
-        return now[0] + runge_kutta_mean(slopes, h), torch.where(bent <= now[1], now[1], bent)
+    def advanced(x: Tensor) -> tuple[Tensor, Tensor]:
+        _, slopes = runge_kutta_stages(lambda at, share: _drift(system, at), x, h)
+        return x + runge_kutta_mean(slopes, h), h * (slopes[2] - slopes[1]).abs().amax(-1)
 
+    def substep(now: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+        after, bent = advanced(now[0])
+        return after, torch.where(bent <= now[1], now[1], bent)
+
+    if count == 1:
+        return advanced(x)
     found: tuple[Tensor, Tensor] = repeat(count, substep, (x, torch.zeros_like(x[..., 0])))
     return found
 
