@@ -20,6 +20,7 @@ from .base import ControlAffineSystem
 
 _log = logging.getLogger(__name__)
 _TOLERANCE, _BENT, _TRIED, _MOST = 1e-6, 3e-3, 16, 1024  # as of loops: `adp.simulate`
+_TOGETHER = 1 << 14  # states that are looked at together, which a cache holds
 _PAYS = 10_000  # steps of a small batch in plain torch (some .1 ms each) that take as long as to compile
 
 
@@ -69,7 +70,9 @@ def trajectory(
             continue
         (after, bent, reach), piece = program((x, none, none), steps=stop - start)
         if bool(bent.isnan().all()):  # by plain torch, which takes as long for all states at once as for one
-            bent, reach = _advanced(system, piece, dt, 1)[1].amax(1), piece.abs().amax(-1).amax(1)
+            some = piece.split(max(1, _TOGETHER // piece.shape[1]))
+            bent = torch.cat([_advanced(system, part, dt, 1)[1].amax(1) for part in some])
+            reach = piece.abs().amax(-1).amax(1)
         strained = ~(bent <= _BENT * reach) & torch.isfinite(reach)
         if bool(strained.any()):
             after, piece = _refined(system, dt, x, after, piece, strained.nonzero().squeeze(1))
