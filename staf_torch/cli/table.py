@@ -15,12 +15,13 @@ from ..results.untrusted import visible
 from ..tables import Layout, Print, Style, Table, json_text, latex_text, parquet_bytes, tabulate
 from ..tables.aggregate import AGGREGATES
 from ..tables.latex import parts
+from ..tables.model import escaped
 
 
 def markdown_text(table: Table, about: Print) -> str:
     """Return the table in Markdown, or one for each value of a setting with a line above."""
     texts = [(value, part.markdown()) for value, part in parts(table, about.split)]
-    return "\n".join(f"{value}\n\n{text}" if value else text for value, text in texts)
+    return "\n".join(f"{escaped(value)}\n\n{text}" if value else text for value, text in texts)
 
 
 _READ: dict[str, Callable[[Table, Print], str]] = {"md": markdown_text, "tex": latex_text}

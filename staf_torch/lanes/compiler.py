@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
 import hashlib
@@ -162,7 +163,10 @@ def _run(command: list[str]) -> str:
         try:
             out, err = process.communicate(timeout=seconds)
         except BaseException as error:
-            os.killpg(process.pid, signal.SIGKILL)  # with what the driver has started, which works on else
+            with contextlib.suppress(ProcessLookupError):  # it has just ended
+                os.killpg(
+                    process.pid, signal.SIGKILL
+                )  # with what the driver has started, which works on else
             if isinstance(error, subprocess.TimeoutExpired):
                 raise OSError(f"{command[0]} took more than {seconds:g} s (STAF_COMPILE_SECONDS)") from error
             raise

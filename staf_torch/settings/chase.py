@@ -190,13 +190,14 @@ def make(cfg: DictConfig | PlainSettings) -> Any:
         ValueError: if its constructor has no such argument, or needs one that is not there.
     """
     try:
-        partial = {"_partial_": True} if _lacks_arguments(cfg) else {}
-        return instantiate(cfg, _convert_="all", **partial)
+        return instantiate(cfg, _convert_="all")
     except Exception as error:
         cause = error if isinstance(error, TypeError) else error.__cause__  # Hydra 1.3 wraps, 1.4 does not
         if isinstance(cause, TypeError) and re.search(
             r"unexpected keyword argument|missing \d+ req", str(cause)
         ):
+            if _lacks_arguments(cfg):  # asked when Hydra has let the name pass
+                return instantiate(cfg, _convert_="all", _partial_=True)
             raise ValueError(f"`{cfg._target_}` cannot be built from these settings: {cause}.") from error
         raise
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 
 from ..numerics import TABLE_COMMAND, fail
@@ -153,7 +154,8 @@ def _one(table: Table, about: Print, part: str) -> str:
 
 
 def _label(label: str, part: str) -> str:
-    return f"{label}-{part.partition('=')[2]}" if part else label
+    value = re.sub(r"[^A-Za-z0-9.:-]", "-", part.partition("=")[2])  # a run's text is nobody's LaTeX
+    return f"{label}-{value}" if part else label
 
 
 def _needed(table: Table) -> tuple[list[PrintedColumn], list[str], str]:

@@ -65,9 +65,9 @@ class Table:
         """Return the table in Markdown, aligned as text too, then a line for each note."""
         columns = self.printed()
         over = {column.over for column in columns if column.over}
-        title = f"{_escaped(over.pop())}\n\n" if len(over) == 1 else ""
-        heads = [_escaped(f"{c.over}, {c.heading}" if c.over and not title else c.heading) for c in columns]
-        lines = self.texts(_escaped, lambda number: show(number, self.style.digits), "-", "**{}**")
+        title = f"{escaped(over.pop())}\n\n" if len(over) == 1 else ""
+        heads = [escaped(f"{c.over}, {c.heading}" if c.over and not title else c.heading) for c in columns]
+        lines = self.texts(escaped, lambda number: show(number, self.style.digits), "-", "**{}**")
         widths = [max(3, *(len(line[k]) for line in [heads, *lines])) for k in range(len(columns))]
 
         def joined(cells: list[str]) -> str:
@@ -75,7 +75,7 @@ class Table:
             return "| " + " | ".join(t.rjust(w) if c.numeric else t.ljust(w) for t, w, c in aligned) + " |\n"
 
         rule = ["-" * (w - 1) + ":" if c.numeric else "-" * w for w, c in zip(widths, columns, strict=True)]
-        notes = "".join(f"\n{_escaped(note)}\n" for note in self.notes)
+        notes = "".join(f"\n{escaped(note)}\n" for note in self.notes)
         return title + joined(heads) + joined(rule) + "".join(joined(line) for line in lines) + notes
 
     def csv(self) -> str:
@@ -119,7 +119,7 @@ def _csv_cell(value: Value) -> Value:
     return f"'{value}" if isinstance(value, str) and _FORMULA.match(value) else value
 
 
-def _escaped(text: str) -> str:
+def escaped(text: str) -> str:
     """On one line, without what would end the cell, begin a tag, a link or an image, or stay open.
 
     Code in `single backquotes` stays.

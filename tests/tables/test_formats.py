@@ -18,6 +18,7 @@ import pytest
 from sweep_runs import BAD_COUNT, write_sweep
 from tables.test_aggregation import PIVOT
 
+from staf_torch.cli.table import markdown_text
 from staf_torch.results.reader import Collection, collect
 from staf_torch.tables import Layout, Style, Table, html_text, json_text, latex_text, parquet_bytes, tabulate
 from staf_torch.tables.columns import Column, Number, Row, printed, significant
@@ -157,6 +158,16 @@ def test_a_table_is_set_in_a_column_of_a_page_without_a_hand_edit(found: Collect
     said = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert said.returncode == 0, said.stdout
     assert "Overfull" not in said.stdout
+
+
+def test_a_value_of_a_run_is_nobodys_latex_or_markdown() -> None:
+    harm = "}\\input{/etc/passwd} <b>|"
+    table = Table((Column("k"), Column("m", "m")), (Row({"k": harm, "m": 0.1}), Row({"k": "b", "m": 0.2})))
+    about = Print("Caption.", "tab:e", split="k")
+    text = latex_text(table, about)
+    assert r"\input" not in text
+    assert r"\label{tab:e---input--etc-passwd---b--}" in text
+    assert "<b>" not in markdown_text(table, about).replace(r"\<b>", "")
 
 
 def test_a_column_that_only_repeats_another_is_left_out() -> None:
