@@ -1,14 +1,19 @@
-"""Cost of a call of a row program: what a header, or an ONNX file in loops, computes for one row."""
+"""Scalar programs of one row for headers and ONNX files in loops, and what a call of them costs."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import torch
+from torch import Tensor
 
+from ..lanes.call import Given
 from ..lanes.emit.schedule import Schedule
-from ..lanes.trace.step import Traced
+from ..lanes.row_independence import doubt
+from ..lanes.trace.step import Step, Traced, trace
+from ..lanes.trace.tracer import NotLoweredError
 from .sheet import Work
 
 _CHEAP = set("add sub mul div lt le eq ne and or xor neg abs min max not where sqrt".split())  # noqa: SIM905
@@ -50,3 +55,16 @@ def counted(traced: Traced) -> Source:
         elif op not in _FREE:
             functions += count
     return Source(constants, flops, functions)
+
+
+def traced_row(step: Step, row: Mapping[str, Tensor]) -> Traced | None:
+    """Return the trace of a step of a row without a carry, (1, ...); None where it has no scalar form."""
+    two = {key: part.expand(2, *part.shape[1:]).contiguous() for key, part in row.items()}
+    given = Given.of((), (), two, 1)
+    try:
+        traced = trace(step, given, folded=True)
+    except NotLoweredError:
+        return None
+    real = next(iter(row.values())).dtype
+    plain = all(len(shape) < 2 and dtype == real for shape, dtype in traced.outputs)
+    return traced if plain and doubt(step, given) is None else None
