@@ -36,3 +36,15 @@ def learner(law: ActorCriticLaw, extrapolation: adp.Extrapolation | None = None)
 def uniform(rows: int, box: float, seed: int = 0) -> Tensor:
     generator = torch.Generator().manual_seed(seed)
     return box * (2 * torch.rand(rows, 2, dtype=torch.float64, generator=generator) - 1)
+
+
+class Yaw(systems.ControlAffineSystem):
+    """An angle that is pushed: theta'' = u."""
+
+    dim, inputs, periodic = 2, 1, (0,)
+
+    def drift(self, x: Tensor) -> Tensor:
+        return torch.stack((x[..., 1], 0 * x[..., 1]), -1)
+
+    def effectiveness(self, x: Tensor) -> Tensor:
+        return torch.tensor([[0.0], [1.0]]).to(x).expand(*x.shape, 1)

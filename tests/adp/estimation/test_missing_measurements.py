@@ -9,6 +9,7 @@ import pytest
 import torch
 from helpers import tensor, uniform
 from helpers_adaptation import PENDULUM
+from helpers_adp import Yaw
 from torch import Tensor
 
 from staf_torch import GaussianKernel, adp, rings, systems
@@ -244,22 +245,12 @@ def test_a_state_that_is_never_measured_is_found_by_the_model() -> None:
     assert now.missed.tolist() == [[0.0, 40.0]]
 
 
-class Wheel(systems.ControlAffineSystem):
-    dim, inputs, periodic = 2, 1, (0,)
-
-    def drift(self, x: Tensor) -> Tensor:
-        return torch.stack((x[..., 1], 0 * x[..., 1]), -1)
-
-    def effectiveness(self, x: Tensor) -> Tensor:
-        return torch.tensor([[0.0], [1.0]]).to(x).expand(*x.shape, 1)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("unit", "turn"), [(1.0, 2 * math.pi), (180 / math.pi, 360.0)])
 def test_a_measured_angle_is_compared_around_the_circle(
     kind: type[KalmanFilter], unit: float, turn: float
 ) -> None:
-    filter = kind(Wheel(), lambda x: unit * x[..., :1], noise=[0.01 * unit], process=0.1)
+    filter = kind(Yaw(), lambda x: unit * x[..., :1], noise=[0.01 * unit], process=0.1)
     x = torch.stack(
         (0.1 + 2.0 * DT * torch.arange(80), torch.full((80,), 2.0)), -1
     ).double()  # two turns and more

@@ -8,22 +8,13 @@ import numpy as np
 import pytest
 import torch
 from helpers import tensor, uniform
+from helpers_adp import Yaw
 from torch import Tensor
 
 from staf_torch import adp, systems
 from staf_torch.metrics.closed_loop import regulated
 
 TURN = 2 * math.pi
-
-
-class Yaw(systems.ControlAffineSystem):
-    dim, inputs, periodic = 2, 1, (0,)
-
-    def drift(self, x: Tensor) -> Tensor:
-        return torch.stack((x[..., 1], 0 * x[..., 1]), -1)
-
-    def effectiveness(self, x: Tensor) -> Tensor:
-        return torch.tensor([[0.0], [1.0]]).to(x).expand(*x.shape, 1)
 
 
 class Arms(systems.ControlAffineSystem):
