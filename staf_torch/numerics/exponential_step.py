@@ -20,6 +20,10 @@ from torch import Tensor
 from ..lanes import scan
 from .linalg import exponential
 
+TOLERANCE = 1e-6  # error of a hold or a step of a trajectory, relative to the state
+GRACE = 10.0  # times the tolerance: more steps are tried, and what is left above it is a warning
+BENT = 3e-3  # of the state: more bending is looked at; of a mode (h / tau)^3 / 4, beside an error of 5e-6
+TRIED, MOST = 16, 1024  # holds of a row that are repeated; steps of one at most
 _NEAR = 4.0  # an error that doubling the steps divides by less is one of rounding, or of a rate with corners
 _MOSTLY, _DOUBLINGS, _BOUNDED = 0.75, 2, 0.5  # share of the samples; doublings since; relative error
 _SMALL = 1e-3  # relative errors above which more steps are tried all the same

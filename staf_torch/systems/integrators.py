@@ -14,12 +14,11 @@ from ..lanes.compiled_methods import undecided, worth
 from ..lanes.loop_program import LoopProgram
 from ..lanes.tree import Tree
 from ..numerics.checks import integer, positive_real, trailing
-from ..numerics.exponential_step import needed_steps
+from ..numerics.exponential_step import BENT, GRACE, MOST, TOLERANCE, TRIED, needed_steps
 from ..numerics.runge_kutta import runge_kutta_mean, runge_kutta_stages
 from .base import ControlAffineSystem
 
 _log = logging.getLogger(__name__)
-_TOLERANCE, _BENT, _TRIED, _MOST = 1e-6, 3e-3, 16, 1024  # as of loops: `adp.simulate`
 _TOGETHER = 1 << 14  # states that are looked at together, which a cache holds
 _PAYS = 10_000  # steps of a small batch in plain torch (some .1 ms each) that take as long as to compile
 
@@ -73,7 +72,7 @@ def trajectory(
             some = piece.split(max(1, _TOGETHER // piece.shape[1]))
             bent = torch.cat([_advanced(system, part, dt, 1)[1].amax(1) for part in some])
             reach = piece.abs().amax(-1).amax(1)
-        strained = ~(bent <= _BENT * reach) & torch.isfinite(reach)
+        strained = ~(bent <= BENT * reach) & torch.isfinite(reach)
         if bool(strained.any()):
             after, piece = _refined(system, dt, x, after, piece, strained.nonzero().squeeze(1))
         x = after
@@ -132,7 +131,7 @@ def _refined(
     states = piece[rows]
     bent = _advanced(system, states, dt, 1)[1].nan_to_num(math.inf, math.inf)
     bent = torch.where(torch.isfinite(states).all(-1), bent, -1.0)
-    at = bent.topk(min(_TRIED, bent.shape[1]), dim=1).indices.unsqueeze(-1)
+    at = bent.topk(min(TRIED, bent.shape[1]), dim=1).indices.unsqueeze(-1)
     tried = states.gather(1, at.expand(-1, -1, x.shape[-1]))
     known = torch.isfinite(tried).all(-1)
 
@@ -142,8 +141,8 @@ def _refined(
         wrong = torch.where(known[some], (now - better).abs().amax(-1), 0.0).amax(1)
         return (wrong / torch.where(known[some], size, 0.0).amax(1)).nan_to_num(math.inf, math.inf)
 
-    most = torch.full((len(rows),), _MOST, dtype=torch.int64)
-    found = needed_steps(errors, most, _TOLERANCE, 10 * _TOLERANCE)
+    most = torch.full((len(rows),), MOST, dtype=torch.int64)
+    found = needed_steps(errors, most, TOLERANCE, GRACE * TOLERANCE)
     for factor in found.factor.unique().tolist():
         chosen = rows[(found.factor == factor).to(rows.device)]
         if factor > 1:
@@ -151,12 +150,12 @@ def _refined(
             times = piece.shape[1]
             (end, _, _), again = _stepped(system, dt, factor, times, len(chosen))(begun, steps=times)
             after, piece = after.index_copy(0, chosen, end), piece.index_copy(0, chosen, again)
-    wrong = found.error > 10 * _TOLERANCE
+    wrong = found.error > GRACE * TOLERANCE
     if bool(wrong.any()):
         _log.warning(
             "a trajectory of %s in steps of %.4g s is wrong by more than %.0e of its state a step in %d "
             "rows, by %.2g in row %d: its rate is too fast for this dt, or has corners.",
-            *(type(system).__name__, dt, 10 * _TOLERANCE, int(wrong.sum()), float(found.error.max())),
+            *(type(system).__name__, dt, GRACE * TOLERANCE, int(wrong.sum()), float(found.error.max())),
             int(rows[int(found.error.argmax())]),
         )
     return after, piece

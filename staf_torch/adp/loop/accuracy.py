@@ -13,19 +13,17 @@ import math
 import torch
 from torch import Tensor, nn
 
-from ...numerics.exponential_step import StepsNeeded, needed_steps
-from ..problem.held_plant import GRACE, TOLERANCE, Holding
+from ...numerics.exponential_step import GRACE, MOST, TOLERANCE, TRIED, StepsNeeded, needed_steps
+from ..problem.held_plant import Holding
 
 _log = logging.getLogger(__name__)
-BENT = 3e-3  # of the state: more bending is looked at; of a mode (h / tau)^3 / 4, beside an error of 5e-6
-_TRIED = 16  # holds of a row
 _MODELS = 100.0  # times the tolerance, before a controller's model is a warning
-_MOST, _MOST_FROZEN = 1024, 64  # times the steps; of a row that left the finite numbers
+_MOST_FROZEN = 64  # times the steps of a row that left the finite numbers
 _TOGETHER = 1 << 16  # holds that are repeated at once
 
 
 @torch.no_grad()
-def needed(holding: Holding, x: Tensor, u: Tensor, frozen: Tensor, most: int = _MOST) -> StepsNeeded:
+def needed(holding: Holding, x: Tensor, u: Tensor, frozen: Tensor, most: int = MOST) -> StepsNeeded:
     """Return by how much rows must multiply their steps for 1e-6 in all of their holds.
 
     Args:
@@ -78,7 +76,7 @@ def hardest(
     bent = torch.cat([holding.watched(x, u)[2] for x, u in pieces]).view(held.shape)
     bent = torch.where(held, bent.nan_to_num(math.inf, math.inf), -1.0)
     bent[:, 0] = math.inf
-    at = bent.topk(min(_TRIED, bent.shape[1]), dim=1).indices.unsqueeze(-1)
+    at = bent.topk(min(TRIED, bent.shape[1]), dim=1).indices.unsqueeze(-1)
     x = state.gather(1, at.expand(-1, -1, state.shape[-1]))
     u = control.gather(1, at.expand(-1, -1, control.shape[-1]))
     last = (held.sum(1) - 1).clamp(min=0)[:, None, None].expand(-1, -1, control.shape[-1])

@@ -17,11 +17,12 @@ from ...lanes.loop_program import LoopProgram
 from ...lanes.tree import flatten, unflatten
 from ...numerics.angles import wrap
 from ...numerics.checks import choice, copied, fail, integer, positive_real, trailing
+from ...numerics.exponential_step import BENT
 from ...systems import ControlAffineSystem, Plant
 from ..problem.cost import Cost
 from ..problem.held_plant import RESOLVED, Holding, Substeps, fewest_and_most
 from ..problem.rules import warn_if_restless, warn_if_unstable
-from .accuracy import BENT, hardest, needed, warn_of_errors, warn_of_models
+from .accuracy import hardest, needed, warn_of_errors, warn_of_models
 from .controller import Carried, Controller, Feedback, Policy
 from .step import ClosedLoop, LoopState, program, record, row_numbers
 

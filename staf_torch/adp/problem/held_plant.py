@@ -15,6 +15,9 @@ from ...lanes import repeat, scan
 from ...lanes.loops import untraced
 from ...numerics.checks import integer, positive_real
 from ...numerics.exponential_step import (
+    GRACE,
+    MOST,
+    TOLERANCE,
     ExponentialStep,
     StepCount,
     exponential_stages,
@@ -27,11 +30,9 @@ from .cost import Cost
 from .held_linear import periods
 
 _log = logging.getLogger(__name__)
-TOLERANCE = 1e-6  # error of a hold, relative to the state
 RESOLVED = 0.2  # of the time constant of the fastest mode, that one classical step may take: 3e-6 in error
-GRACE = 10.0  # times the tolerance: more steps are tried, and what is left above it is a warning
 _OUTSIDE = 100.0  # likewise in a few states far out
-_SOME, _MOST = 64, 1024  # substeps with which most plants stay finite; that are chosen at most
+_SOME = 64  # substeps with which most plants stay finite
 _SAMPLES, _SHARE = 24, 0.8  # states; the share that one step must serve, as it nearly must all
 _MOVED = 0.1  # of the spread, in a hold, by inputs without bounds
 _DEARER = 1.5  # work of an exponential step, in classical ones
@@ -277,10 +278,10 @@ class Holding:
                 linear = None
             elif self.cost is not None:
                 self.curvature = self.cost.state_curvature()
-            dear = StepCount(_MOST, math.inf)
+            dear = StepCount(MOST, math.inf)
             if linear is not None:
-                dear = fewest_steps(errors(linear), TOLERANCE, _MOST)
-            most = _MOST if dear.error > TOLERANCE else min(_MOST, math.ceil(_DEARER * dear.number))
+                dear = fewest_steps(errors(linear), TOLERANCE, MOST)
+            most = MOST if dear.error > TOLERANCE else min(MOST, math.ceil(_DEARER * dear.number))
             found = fewest_steps(errors(None), TOLERANCE, most)
             cheaper = found.error <= TOLERANCE and found.number <= _DEARER * dear.number
             if not cheaper and dear.error < found.error:
@@ -297,7 +298,7 @@ class Holding:
         """Return which holds (P,) the plant itself survives: no number of steps serves a state from which it
         escapes to infinity within one."""
         stays = torch.ones(len(x), dtype=torch.bool)
-        for count in (_SOME, _MOST):
+        for count in (_SOME, MOST):
             asked = stays.clone() if count == _SOME else ~stays
             if bool(asked.any()):
                 after = self._with(count, None)(x[asked], u[asked])[0]
