@@ -50,6 +50,8 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     figures = flag(COMMAND_LINE, "figures", cfg.figures)
     settle = non_negative(COMMAND_LINE, "settle_time", cfg.settle_time)
     plant, gains = published(), _gains(cfg)
+    if settle > positive_real(COMMAND_LINE, "duration", cfg.duration):
+        raise fail(COMMAND_LINE, "settle_time", "must be before the end", cfg.settle_time)
     found = {name: _followed(cfg, plant, gains, source) for source, name in SOURCES.items()}
     time = found["integral"].time
     late = time >= settle

@@ -22,21 +22,25 @@ needs_cc = pytest.mark.skipif(
 )
 
 
+def library_of(problem: adp.SampledProblem, x: Tensor) -> Trajectories:
+    """Sixty steps of the linear feedback, instead of a search that takes seconds."""
+    states, controls, rows = [x], [], len(x)
+    for _ in range(60):
+        controls.append(0.98 * problem.linear_feedback(states[-1]))  # told from the feedback of the goal
+        states.append(problem.advance(states[-1], controls[-1])[0])
+    state, control = torch.stack(states, dim=1), torch.stack(controls, dim=1)
+    gains, bent = (-problem.k).expand(rows, 60, 1, 2), (2 * problem.p).expand(rows, 61, 2, 2)
+    slope = (bent * problem.away(state).unsqueeze(-2)).sum(-1)
+    fine = torch.ones(rows, dtype=torch.bool)
+    return Trajectories(state, control, gains, problem.terminal(state), slope, bent, fine)
+
+
 @pytest.fixture(scope="module")
 def memory() -> adp.GlobalValue:
     """Of a pendulum near the top, where the angle may pass a whole turn."""
     problem, turn = pendulum(), 2 * math.pi
     x = torch.tensor([[0.3, 0.0], [-0.2, 0.1], [turn - 0.2, 0.3], [-turn + 0.2, -0.5]], dtype=torch.float64)
-    states, controls = [x], []
-    for _ in range(60):  # the linear feedback, instead of a search that takes seconds
-        controls.append(0.98 * problem.linear_feedback(states[-1]))  # told from the feedback of the goal
-        states.append(problem.advance(states[-1], controls[-1])[0])
-    state, control = torch.stack(states, dim=1), torch.stack(controls, dim=1)
-    gains, bent = (-problem.k).expand(4, 60, 1, 2), (2 * problem.p).expand(4, 61, 2, 2)
-    slope = (bent * problem.away(state).unsqueeze(-2)).sum(-1)
-    fine = torch.ones(4, dtype=torch.bool)
-    library = Trajectories(state, control, gains, problem.terminal(state), slope, bent, fine)
-    return adp.GlobalValue(problem, library, [math.pi, 8.0], candidates=12, lookahead=6)
+    return adp.GlobalValue(problem, library_of(problem, x), [math.pi, 8.0], candidates=12, lookahead=6)
 
 
 def states(count: int) -> Tensor:
@@ -85,9 +89,10 @@ def test_memory_in_float_chooses_nearly_the_same_control(memory: adp.GlobalValue
     assert "rintf(" in path.read_text()
 
 
-def test_traced_memory_has_the_control_of_the_library_at_every_batch(memory: adp.GlobalValue) -> None:
-    x = states(20)
-    short = adp.GlobalValue(memory.problem, memory.library, memory.region, candidates=1, lookahead=1)
+def test_traced_memory_has_the_control_of_the_library_at_every_batch() -> None:
+    x, problem = states(20), double_integrator(-1.0, 1.0)
+    library = library_of(problem, torch.tensor([[0.3, 0.0], [-0.2, 0.1]]).double())
+    short = adp.GlobalValue(problem, library, [1.0, 1.0], candidates=1, lookahead=1)
     program = deploy.trace(deploy.policy_of(short), x).module()  # what ONNX, pt2 and aoti are written from
     for rows in (x, x[:1]):
         torch.testing.assert_close(program(rows), short(rows), rtol=0, atol=1e-12)

@@ -8,6 +8,7 @@ import pickle
 
 import pytest
 from composing import compose
+from hydra.core.config_loader import ConfigLoader
 from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import OmegaConf
@@ -38,16 +39,23 @@ JOBS = [
 ]
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _launcher() -> None:
+@pytest.fixture(scope="module")
+def loader() -> ConfigLoader:
     find_launcher()  # also where the package is on the path and not installed
+    return config_loader()
+
+
+@pytest.fixture(scope="module")
+def composer(loader: ConfigLoader) -> Composer:
+    """One for all tests: what it keeps of one configuration is no part of another."""
+    return Composer(loader)
 
 
 @pytest.mark.parametrize("job", JOBS, ids=" ".join)
-def test_a_configuration_is_the_one_that_hydra_composes(job: list[str]) -> None:
-    loader = config_loader()
+def test_a_configuration_is_the_one_that_hydra_composes(
+    job: list[str], loader: ConfigLoader, composer: Composer
+) -> None:
     expected = loader.load_configuration("config", ["dt=0.02", *job], RunMode.RUN)
-    composer = Composer(loader)
     first, again = (composer.whole(["dt=0.02", *job]) for _ in range(2))
     for found in (first, again):
         assert OmegaConf.to_yaml(found) == OmegaConf.to_yaml(expected)
@@ -71,13 +79,13 @@ def test_a_configuration_is_the_one_that_hydra_composes(job: list[str]) -> None:
     ],
 )
 @pytest.mark.parametrize("mode", [RunMode.MULTIRUN, RunMode.RUN])
-def test_the_configuration_of_a_sweep_is_the_one_that_hydra_composes(line: str, mode: RunMode) -> None:
-    loader = config_loader()
+def test_the_configuration_of_a_sweep_is_the_one_that_hydra_composes(
+    line: str, mode: RunMode, loader: ConfigLoader, composer: Composer
+) -> None:
     words = line.split()
     if mode == RunMode.RUN:
         words = [word for word in words if "," not in word and "range" not in word]
     expected = loader.load_configuration("config", words, mode)
-    composer = Composer(loader)
     for _ in range(2):
         found = composer.load_configuration("config", words, mode)
         assert OmegaConf.to_yaml(found) == OmegaConf.to_yaml(expected)
@@ -85,24 +93,25 @@ def test_the_configuration_of_a_sweep_is_the_one_that_hydra_composes(line: str, 
         assert OmegaConf.is_readonly(found.hydra) == OmegaConf.is_readonly(expected.hydra)
 
 
-def test_jobs_of_other_launchers_have_the_configuration_that_hydra_composes() -> None:
-    loader = config_loader()
+def test_jobs_of_other_launchers_have_the_configuration_that_hydra_composes(
+    loader: ConfigLoader, composer: Composer
+) -> None:
     lines = ["seed=1,2", "kernel=matern,gaussian", "hydra.sweep.dir=here", "hydra/launcher=basic"]
     master = loader.load_configuration("config", lines, RunMode.MULTIRUN)
-    composer = Composer(loader)
     for job in (["seed=1", "kernel=matern"], ["seed=2", "kernel=matern"], ["seed=2", "kernel=gaussian"]):
         expected, found = (each.load_sweep_config(master, job) for each in (loader, composer))
         assert OmegaConf.to_yaml(found) == OmegaConf.to_yaml(expected)
 
 
 @pytest.mark.parametrize("line", ["seed=1,2", "hydra.launcher.batch=1,2", "kernle=a"])
-def test_a_sweep_is_refused_where_a_run_was_asked_for(line: str) -> None:
-    loader = config_loader()
+def test_a_sweep_is_refused_where_a_run_was_asked_for(
+    line: str, loader: ConfigLoader, composer: Composer
+) -> None:
     mode = RunMode.MULTIRUN if line.startswith("hydra") else RunMode.RUN
     with pytest.raises(HydraException) as expected:
         loader.load_configuration("config", [line], mode)
     with pytest.raises(type(expected.value)) as found:
-        Composer(loader).load_configuration("config", [line], mode)
+        composer.load_configuration("config", [line], mode)
     assert str(found.value) == str(expected.value)
 
 
@@ -124,9 +133,9 @@ SAME_KEYS = [
 ]
 
 
-def test_a_configuration_holds_nothing_of_those_composed_before() -> None:
-    loader = config_loader()
-    composer = Composer(loader)
+def test_a_configuration_holds_nothing_of_those_composed_before(
+    loader: ConfigLoader, composer: Composer
+) -> None:
     for job in SAME_KEYS:
         line = ["dt=0.02", "trajectories=2", *job]
         expected = OmegaConf.to_container(loader.load_configuration("config", line, RunMode.RUN))
@@ -142,11 +151,11 @@ def test_a_configuration_holds_nothing_of_those_composed_before() -> None:
     "line",
     ["kernle=gaussian", "centers.raduis=1", "kernel=nope", "seed=1,2", "~nothing", "+seed=1", "seed=[1"],
 )
-def test_what_hydra_refuses_is_refused_in_its_words(line: str) -> None:
-    loader = config_loader()
+def test_what_hydra_refuses_is_refused_in_its_words(
+    line: str, loader: ConfigLoader, composer: Composer
+) -> None:
     with pytest.raises(HydraException) as expected:
         loader.load_configuration("config", [line], RunMode.RUN)
-    composer = Composer(loader)
     for _ in range(2):
         with pytest.raises(type(expected.value)) as found:
             composer([line])
@@ -182,11 +191,12 @@ def test_the_size_of_a_sweep_is_counted_and_not_written_out(lines: list[str], si
     assert sweep_size([parse_override(line) for line in lines]) == size
 
 
-def test_plain_settings_are_those_of_hydra_and_nothing_that_refers_to_another_is_plain() -> None:
+def test_plain_settings_are_those_of_hydra_and_nothing_that_refers_to_another_is_plain(
+    composer: Composer,
+) -> None:
     lines = [
         ["dt=0.02", "trajectories=2", *job] for job in (*SAME_KEYS, *JOBS[:-2], ["seed=5", "spread=2.0"])
     ]
-    composer = Composer(config_loader())
     many, flats = composer.many(lines)
     plain = []
     for line, found, by_key, cfg in zip(lines, many.read(), flats, many, strict=True):

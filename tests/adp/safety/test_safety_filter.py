@@ -41,7 +41,7 @@ def passing(x: Tensor, t: Tensor) -> Tensor:
 
 def test_far_from_the_edge_not_a_bit_changes_and_rows_are_alone() -> None:
     guard = adp.SafetyFilter(
-        lambda x: -x[..., 2:], PLANE, [disc, passing], dt=0.01, low=[-1.0, -2.0], high=1.5
+        lambda x: -x[..., 2:], PLANE, [disc, passing], dt=0.02, low=[-1.0, -2.0], high=1.5
     )
     x, u = uniform(24, 4, seed=1, low=-2.0, high=2.0), uniform(24, 2, seed=2, low=-0.9, high=0.9)
     t = uniform(24, low=0.0, high=2.0, seed=3)
