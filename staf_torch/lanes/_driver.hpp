@@ -1,6 +1,6 @@
 // Tiles of rows through pieces of time. What a program must define before: the numbers of entries ROWS, NOWS,
-// AHEAD, CARRIES, FIXED, the slots SLOTS_*, COPIES of a vector that advance together, and `prepare`, `ahead`
-// and `advance`.
+// AHEAD, CARRIES, FIXED, the slots SLOTS_*, COPIES of a vector that advance together, the operations WORK_ROW of a row
+// and WORK_STEP of a step, and `prepare`, `ahead` and `advance`.
 
 #pragma once
 
@@ -191,12 +191,18 @@ struct Recorder {
     }
 };
 
+// Operations of vectors, .4 ns each, that repay another thread: 100 us, where it takes 20 to wake one. Up to `brief`
+// of them, 20 ms, a call is not to wait for a thread that something else interrupts.
+constexpr double grain = 250000, brief = 5e7;
+
 extern "C" void lanes_run(const Call *call, REAL *const *data, int64_t most_threads) {
+    const double operations = double((call->rows + W - 1) / W) * (WORK_ROW + double(call->times) * WORK_STEP);
+    if (operations < grain * double(most_threads)) most_threads = operations < grain ? 1 : int64_t(operations / grain);
     const int64_t even = (call->rows + most_threads - 1) / most_threads;
     const int64_t wanted = (even + lanes - 1) / lanes * lanes, tile = wanted < tile_rows ? wanted : tile_rows;
     const int64_t tiles = (call->rows + tile - 1) / tile, few = call->rows < tile ? call->rows : tile;
     Work work{*call, data, few, 0};
     const int threads = int(tiles < most_threads ? tiles : most_threads);
-    if (threads > 1 && call->parallel) return call->parallel(Work::task, &work, unsigned(threads), 0);
+    if (threads > 1 && call->parallel) return call->parallel(Work::task, &work, unsigned(threads), operations < brief ? 8 : 0);
     work.run();
 }

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
 import itertools
 import mmap
+import os
 import struct
 from collections.abc import Callable, Hashable, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from .compiler import compiled
 from .tree import Shared, Tree, flatten, plain, unflatten
 
 LARGE = 2**22  # bytes from which pages of two megabytes are worth asking for
@@ -205,12 +209,22 @@ def _even(shape: Sequence[int], strides: Sequence[int]) -> bool:
 
 @functools.cache
 def _parallel() -> int | None:
-    """The OpenMP entry that torch itself runs on: a second pool of threads would fight for the same cores."""
-    try:
-        entry = getattr(ctypes.CDLL(torch._C.__file__), "GOMP_parallel", None)
-    except OSError:
-        return None
+    """The address of what runs a call on several threads, None where there is nothing but this one.
+
+    Threads of our own: those of OpenMP, which torch runs on, spin until the last of them has come, which
+    beside other busy processes takes 8 to 60 ms, whatever the call. Where the user binds OpenMP's threads to
+    processors, ours would all stand on that of the caller, and OpenMP's serve.
+    """
+    entry: Any = None
+    if not any(os.environ.get(name) for name in _BINDING):
+        entry = compiled(Path(__file__).with_name("_threads.cpp"))
+    if entry is None:
+        with contextlib.suppress(OSError):
+            entry = getattr(ctypes.CDLL(torch._C.__file__), "GOMP_parallel", None)
     return None if entry is None else ctypes.cast(entry, ctypes.c_void_p).value
+
+
+_BINDING = ("OMP_PROC_BIND", "OMP_PLACES", "GOMP_CPU_AFFINITY")
 
 
 class Given(NamedTuple):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import pytest
@@ -75,11 +76,23 @@ def test_a_row_has_the_same_bits_in_every_batch_and_beside_every_neighbour(dtype
 
 
 def test_threads_do_not_change_bits() -> None:
-    given, threads = inputs(1000), torch.get_num_threads()
-    one = PENDULUM(*given)[1][0]
+    """Nor do threads of the caller that ask at once; a fork has helpers of its own (torch's are gone)."""
+    x, u, row = inputs(1000)
+    given = x, u.repeat(1, 30), row  # some milliseconds: enough for a second thread
+    threads, helping = torch.get_num_threads(), len(os.listdir("/proc/self/task"))
     try:
+        torch.set_num_threads(1)
+        one = PENDULUM(*given)[1][0]
         torch.set_num_threads(2)
-        assert same_bits(PENDULUM(*given)[1][0], one)
+        PENDULUM(*inputs(20))
+        assert len(os.listdir("/proc/self/task")) <= helping  # 20 rows take one
+        with ThreadPoolExecutor(4) as pool:
+            for found in pool.map(lambda _: PENDULUM(*given)[1][0], range(8)):
+                assert same_bits(found, one)
+        child = multiprocessing.get_context("fork").Process(target=lambda: PENDULUM(*given, every=900))
+        child.start()
+        child.join(60)
+        assert child.exitcode == 0
     finally:
         torch.set_num_threads(threads)
 

@@ -30,6 +30,23 @@ _COSTLY, _MEMORY = 20, 4  # operations that a function takes, and that a number 
 _FUNCTIONS = frozenset(
     ("exp", "expm1", "log", "log1p", "sin", "cos", "tan", "tanh", "atan2", "pow", "sqrt", "div")
 )
+_FREE = frozenset(
+    (
+        "const",
+        "param",
+        "row",
+        "now",
+        "state",
+        "elem",
+        "carry",
+        "result",
+        "carrys",
+        "results",
+        "collect",
+        "pack",
+    )
+) | {"loop"}
+_MOST_WORK = 2**30  # so that products with it are numbers of 64 bits
 
 
 class Text(NamedTuple):
@@ -64,6 +81,27 @@ def _worth(graph: Graph, schedule: Schedule) -> bool:
     """Return whether to compute ahead what times alone decide, although it goes through memory."""
     work = sum(_COSTLY if graph.op[n] in _FUNCTIONS else 1 for n in schedule.ahead if graph.op[n] != "now")
     return work > _MEMORY * len(schedule.cut_ahead())
+
+
+def _work(graph: Graph, schedule: Schedule) -> dict[str, int]:
+    """Return the operations of a row before its steps, and of a step: by them threads are called.
+
+    A loop counts with all of its passes, one that rows may leave with an eighth.
+    """
+    once = step = 0
+    for node in schedule.live:
+        op, count = graph.op[node], graph.size(node)
+        if op in _FREE:
+            continue
+        if op in ("map", "dot"):
+            count *= graph.aux[node][1] if op == "dot" else 1
+            op = "add" if op == "dot" else graph.aux[node][0]
+        count *= schedule.repeats(node, skipped=8) * (_COSTLY if op in _FUNCTIONS else 1)
+        if schedule.once(node):
+            once += count
+        else:
+            step += count
+    return {"WORK_ROW": min(once, _MOST_WORK), "WORK_STEP": min(step, _MOST_WORK)}
 
 
 def _copies(schedule: Schedule) -> int:
@@ -103,6 +141,7 @@ class _CppWriter(StatementWriter):
             "SLOTS_NOW": len(layout.nows),
         }
         counts |= {"SLOTS_CARRY": len(layout.carries), "COPIES": self.copies, "TILE": 64}
+        counts |= _work(self.graph, self.schedule)
         single, graph = self.graph.single, self.graph
         functions = sum(graph.op[node] in _LIBRARY for node in self.schedule.live) * self.copies
         calls = ["#define LANES_CALLS 1"] if functions > _CALLED else []

@@ -73,7 +73,7 @@ class Schedule:
 
     def cut(self) -> list[int]:
         """Return the nodes that a row has once and the steps read."""
-        found = self._cut(ROW, self.live, lambda node: not self._once(node))
+        found = self._cut(ROW, self.live, lambda node: not self.once(node))
         return [node for node in found if self._graph.op[node] not in ("const", "param", "row")]
 
     def cut_ahead(self) -> list[int]:
@@ -116,20 +116,26 @@ class Schedule:
         """Return whether two nodes stand in the same block: of one loop, or of one depth outside of all."""
         return self._where[one] == self._where[other]
 
-    def repeats(self, node: int) -> int:
-        """Return how often a step computes a node: the product of the counts of the loops around it."""
+    def repeats(self, node: int, *, skipped: int = 1) -> int:
+        """Return how often a step computes a node: the product of the counts of the loops around it.
+
+        Args:
+            node: that something needs.
+            skipped: one in how many passes counts of a loop whose passes a row may not take.
+        """
         count, owner = 1, self._owner.get(node)
         while owner is not None:
-            count *= self._graph.loops[owner].count
-            owner = self._owner.get(self._graph.loops[owner].node)
+            loop = self._graph.loops[owner]
+            count *= loop.count if loop.going < 0 else -(-loop.count // skipped)
+            owner = self._owner.get(loop.node)
         return count
 
-    def _once(self, node: int) -> bool:
+    def once(self, node: int) -> bool:
         """Return whether a node is computed before the steps, be it inside a loop."""
         depth = self._graph.depth[node]
         if depth <= STEP:
             return depth == ROW
-        return node in self._owner and self._once(self._graph.loops[self._owner[node]].node)
+        return node in self._owner and self.once(self._graph.loops[self._owner[node]].node)
 
     def collected(self, loop: int) -> set[int]:
         """Which outputs of a loop something needs."""
