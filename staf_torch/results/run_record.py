@@ -173,6 +173,13 @@ def read(path: Path) -> dict[str, Any] | None:
         return None
 
 
+def completed(directory: Path) -> list[str] | None:
+    """Return the overrides of the completed run in a directory, None where there is none."""
+    record = read(directory / RUN) or {}
+    lines = record.get("overrides")
+    return [*map(str, lines)] if record.get("status") == COMPLETED and isinstance(lines, list) else None
+
+
 def resumed(cfg: DictConfig) -> bool:
     """Return whether the sweep of these settings takes up an earlier one."""
     return OmegaConf.select(cfg, f"{SETTINGS}.resume") is not None

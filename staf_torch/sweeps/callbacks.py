@@ -118,13 +118,17 @@ class SweepDirectory(Callback):
         lock.give_back(_directory(config))
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
-        """Refuse a run directory in which something leads elsewhere, or that is below a file.
+        """Make the directory of a run and lock it.
 
         Raises:
-            SystemExit: with what leads elsewhere, or the file.
+            SystemExit: if something in it leads elsewhere, it is below a file, or it belongs to another run.
         """
+        directory = Path(str(config.hydra.run.dir))
         try:
-            _refuse_links(Path(str(config.hydra.run.dir)))
+            _refuse_links(directory)
+            directory.mkdir(parents=True, exist_ok=True)
+            lock.hold(directory, "run")
+            _refuse_finished(directory, as_typed(config.hydra.overrides.task))
         except (ValueError, OSError) as error:
             raise SystemExit(f"staf: {sentence(error)}") from error
 
@@ -228,6 +232,11 @@ def claim(config: DictConfig) -> None:
         place = Path(wanted)
         place.mkdir(parents=True, exist_ok=True)
         lock.hold(place)
+        if (place / records.RUN).exists():
+            raise ValueError(
+                f"{wanted} holds a run, and a table would mix it with the sweep's. Choose another "
+                "`hydra.sweep.dir`."
+            )
         if (place / records.SWEEP).exists() or next(place.glob(f"*/{records.RUN}"), None) is not None:
             raise ValueError(
                 f"{wanted} holds a sweep already, and a table of both would mix them. Resume that one with "
@@ -270,6 +279,18 @@ def _refuse_links(directory: Path) -> None:
             f"{visible(str(found[0]))}{more} is a link (or has another name, as hard links have), a pipe or "
             "the like, which no run writes: what goes there would end elsewhere. Remove it, or choose "
             "another directory."
+        )
+
+
+def _refuse_finished(directory: Path, typed: Sequence[str]) -> None:
+    """Raise ValueError where a directory holds a sweep, or a completed run of another command line."""
+    before = records.completed(directory)
+    other = before is not None and sorted(before) != sorted(records.own(typed))
+    if other or (directory / records.SWEEP).exists():
+        holds = f"the run {' '.join(before or ())!r}" if other else "a sweep"
+        raise ValueError(
+            f"{directory} holds {visible(holds)}, which this run would replace. Choose another "
+            "`hydra.run.dir`, or remove what is there."
         )
 
 

@@ -69,6 +69,8 @@ def execute(
         if metrics is not None:
             _log.info("completed before: %s", os.path.relpath(directory))
         else:
+            if node.mode == RunMode.RUN and records.completed(directory) is not None:
+                _log.info("replaces the run of the same command line in %s", os.path.relpath(directory))
             with recorded(record, directory, seconds):
                 record.declare([metric.info for metric in make_metrics(cfg.get("metric"))])
                 metrics = completion(cfg, outcome)(cfg, directory, progress)
@@ -106,8 +108,9 @@ def _log_warning(message: Warning | str, *_: Any, **__: Any) -> None:
 
 def _take_back(directory: Path) -> None:
     """Remove what this run has written, and nothing else: the directory may be the user's own."""
-    if any((directory / name).exists() for name in (METRICS, lock.NAME)):  # of others: they stay
+    if (directory / METRICS).exists() or lock.held(directory) is None:  # of others: they stay
         return
+    lock.give_back(directory)
     shutil.rmtree(directory / ".hydra", ignore_errors=True)
     for name in (records.RUN, "staf.log"):
         (directory / name).unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""A directory belongs to one sweep at a time: a lock that says whose, and ends with its owner."""
+"""A directory belongs to one run or sweep at a time: a lock that says whose, and ends with its owner."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import os
 import socket
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 from ..results.untrusted import UnreadableError, read_object
@@ -19,25 +20,26 @@ _BEAT, _STALE = 30.0, 300.0  # s: how often the owner touches the file, and when
 
 
 class TakenError(ValueError):
-    """Another sweep has the directory; the message says whose it is."""
+    """Another run or sweep has the directory; the message says whose it is."""
 
 
 class DirectoryLock:
-    """The lock of a sweep's directory, held until `release`, or until this process ends, however it ends.
+    """The lock of a directory of a run or sweep, held until `release`, or until this process ends anyhow.
 
     On one machine the kernel knows whether the owner lives. Between machines that share the disk without
     sharing locks, the owner touches the file every half a minute.
 
     Args:
-        directory: of the sweep; it exists.
+        directory: of the run or sweep; it exists.
+        kind: run or sweep.
 
     Raises:
         TakenError: if another one has it.
         OSError: if the directory cannot be written.
     """
 
-    def __init__(self, directory: Path) -> None:
-        self._path = directory / NAME
+    def __init__(self, directory: Path, kind: str = "sweep") -> None:
+        self._path, self.kind = directory / NAME, kind
         self._directory = directory.absolute()
         self._file = self._taken()
         self._inode = os.stat(self._directory)
@@ -92,6 +94,7 @@ class DirectoryLock:
         if host not in (None, socket.gethostname()) and time.time() - os.fstat(file).st_mtime < _STALE:
             raise self._refused()
         about = {
+            "kind": self.kind,
             "host": socket.gethostname(),
             "pid": os.getpid(),
             "since": time.strftime("%Y-%m-%d %H:%M:%S"),
@@ -108,9 +111,9 @@ class DirectoryLock:
     def _refused(self) -> TakenError:
         owner = self._owner()
         return TakenError(
-            f"{self._path.parent} belongs to a sweep that goes on: process {owner.get('pid', '?')} on "
-            f"{owner.get('host', '?')}, since {owner.get('since', '?')}. Wait for its end, or choose another "
-            "`hydra.sweep.dir`."
+            f"{self._path.parent} belongs to a {'run' if owner.get('kind') == 'run' else 'sweep'} that goes "
+            f"on: process {owner.get('pid', '?')} on {owner.get('host', '?')}, since "
+            f"{owner.get('since', '?')}. Wait for its end, or choose another `hydra.{self.kind}.dir`."
         )
 
     def _beat(self) -> None:
@@ -123,12 +126,12 @@ _held: dict[str, DirectoryLock] = {}
 """The locks of this process, by the absolute paths of the directories."""
 
 
-def hold(directory: Path) -> DirectoryLock:
-    """Take the lock of a directory for this process; errors as of `DirectoryLock`."""
+def hold(directory: Path, kind: str = "sweep") -> DirectoryLock:
+    """Take the lock of a directory for this process; arguments and errors as of `DirectoryLock`."""
     key = os.path.abspath(directory)
     if key in _held:
-        raise TakenError(f"{directory} belongs to a sweep that goes on in this process.")
-    _held[key] = DirectoryLock(directory)
+        raise TakenError(f"{directory} belongs to a {_held[key].kind} that goes on in this process.")
+    _held[key] = DirectoryLock(directory, kind)
     return _held[key]
 
 
@@ -142,3 +145,16 @@ def give_back(directory: Path) -> None:
     lock = _held.pop(os.path.abspath(directory), None)
     if lock is not None:
         lock.release()
+
+
+@contextlib.contextmanager
+def returned() -> Iterator[None]:
+    """Context: a directory that was locked inside of it is given back in the end, and removed if empty."""
+    before = set(_held)
+    try:
+        yield
+    finally:
+        for directory in set(_held) - before:
+            give_back(Path(directory))
+            with contextlib.suppress(OSError):  # something is in it
+                os.rmdir(directory)

@@ -34,7 +34,7 @@ def test_a_lock_says_whose_it_is_and_leaves_nothing(tmp_path: Path) -> None:
     taken = DirectoryLock(tmp_path)
     about = json.loads((tmp_path / NAME).read_text())
     assert (about["host"], about["pid"]) == (socket.gethostname(), os.getpid())
-    assert set(about) == {"host", "pid", "since"}
+    assert set(about) == {"kind", "host", "pid", "since"}
     assert not taken.lost()
     taken.release()
     assert list(tmp_path.iterdir()) == []

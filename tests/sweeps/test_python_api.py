@@ -26,6 +26,7 @@ import staf_torch
 from staf_torch import lanes
 from staf_torch.results.files import write_metrics
 from staf_torch.sweeps.hydra_compat.inside import HAS_WHITELIST
+from staf_torch.sweeps.lock import DirectoryLock
 
 SHORT = ("duration=0.1", "settle_time=0.05")
 notebook = operator.methodcaller("_repr_html_")
@@ -160,6 +161,30 @@ def test_ctrl_c_leaves_a_sweep_that_can_be_resumed_and_a_process_as_it_was() -> 
     with pytest.raises(KeyboardInterrupt):
         staf_torch.run("task=test_python_api.interrupted", "seed=1", directory="one")
     assert json.loads(Path("one/run.json").read_text())["reason"] == "interrupted"
+
+
+@pytest.mark.usefixtures("_untouched")
+def test_a_run_has_its_directory_to_itself_and_replaces_no_other_command() -> None:
+    first = staf_torch.run(*BARE, "seed=1", directory="one").metrics
+    assert staf_torch.run("seed=1", *BARE, directory="one").metrics == first  # a manual's line, typed again
+    assert "replaces the run of the same command line in one" in Path("one/staf.log").read_text()
+    before = {path: path.read_bytes() for path in Path("one").rglob("*") if path.is_file()}
+    with pytest.raises(
+        ValueError, match=r"one holds the run 'seed=1 .*', which this run would .*`hydra.run.dir`"
+    ):
+        staf_torch.run(*BARE, "seed=2", directory="one")
+    with pytest.raises(ValueError, match=r"one holds a run, .*`hydra.sweep.dir`"):
+        staf_torch.sweep(*BARE, "seed=2,3", directory="one")
+    other = DirectoryLock(Path("one"), "run")
+    with pytest.raises(
+        ValueError, match=rf"belongs to a run that goes on: process {os.getpid()} .*`hydra.run.dir`"
+    ):
+        staf_torch.run(*BARE, "seed=1", directory="one")
+    other.release()
+    assert {path: path.read_bytes() for path in Path("one").rglob("*") if path.is_file()} == before
+    with pytest.raises(ValueError, match="tracker"):
+        staf_torch.run(*BARE, "tracker=custom", "tracker.path=torch.nn.Linear", directory="three")
+    assert not Path("three").exists()
 
 
 def test_runs_inside_another_hydra_application_and_leaves_it_alone() -> None:

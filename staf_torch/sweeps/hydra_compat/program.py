@@ -26,6 +26,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from ...settings import config_directory
+from .. import lock
 from .composing import Composer
 from .inside import HAS_WHITELIST, TRUSTED, arguments, config_loader, trusted
 from .jobs import handlers_aside
@@ -73,7 +74,8 @@ class Application(NamedTuple):
             BaseException: that of Hydra or of the task.
         """
         self.hydra.config_loader.latest_sweep = None  # but the question whether this is one
-        ended = self.hydra.run(self.name, task, [*self.overrides, "hydra.mode=RUN"])
+        with lock.returned():
+            ended = self.hydra.run(self.name, task, [*self.overrides, "hydra.mode=RUN"])
         config: Any = ended.hydra_cfg
         return Path(config.hydra.runtime.output_dir)
 
