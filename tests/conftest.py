@@ -24,6 +24,7 @@ from recorded import Record
 
 __all__ = ["pytest_make_collect_report", "pytest_runtest_makereport"]
 
+TESTS = Path(__file__).parent
 COMPILED = {"adp", "deploy", "envs", "lanes", "online", "systems"}
 """Rooms whose tests leave the choice to compile to the library."""
 
@@ -100,24 +101,26 @@ def _settings_are_trusted_as_by_the_command() -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True)
-def _same_random_numbers_in_every_order() -> None:
+def _alike_in_every_order(
+    request: pytest.FixtureRequest, quick_cc: Path | None, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[None]:
+    """Random numbers, the log, Hydra's variable, what is compiled and how: one fixture, as each takes time.
+
+    Nothing compiles by itself but in the rooms of `COMPILED` and where a test is marked `compiled`: a build
+    is a second a program.
+    """
+    from staf_torch import lanes
+
     # `torch.manual_seed` also writes down, for every kind of device and with the stack, what is to be done
     # when it begins to be used: a third of what pytest itself takes of a test, and a list that grows.
     torch.default_generator.manual_seed(0)
-
-
-@pytest.fixture(autouse=True)
-def _log_tells_as_much_in_every_order() -> None:
-    """A command that a test ran in this process has set what the log tells."""
-    logging.root.setLevel(logging.WARNING)
-
-
-@pytest.fixture(autouse=True)
-def _nothing_compiles_by_itself(request: pytest.FixtureRequest) -> Iterator[None]:
-    """But in the rooms of `COMPILED` and where a test is marked `compiled`: a build is a second a program."""
-    from staf_torch import lanes
-
-    room = request.path.relative_to(Path(__file__).parent).parts[0]
+    logging.root.setLevel(logging.WARNING)  # a command that a test ran in this process has set it
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)  # `main` sets it for Hydra
+    room = request.path.relative_to(TESTS).parts[0]
+    if room in UNOPTIMISED and not any(words in request.node.name for words in AS_FOR_USERS):
+        monkeypatch.setenv("CXXFLAGS", f"{os.environ.get('CXXFLAGS', '')} -O0")
+    if room in ("adp", "deploy") and quick_cc is not None:
+        monkeypatch.setenv("CC", str(quick_cc))
     compiled = room in COMPILED or request.node.get_closest_marker("compiled") is not None
     with lanes.compiling("auto" if compiled else "never"):
         yield
@@ -135,25 +138,7 @@ def quick_cc(tmp_path_factory: pytest.TempPathFactory) -> Path | None:
     return path
 
 
-@pytest.fixture(autouse=True)
-def _builds_are_quick(
-    request: pytest.FixtureRequest, quick_cc: Path | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    room = request.path.relative_to(Path(__file__).parent).parts[0]
-    if room in UNOPTIMISED and not any(words in request.node.name for words in AS_FOR_USERS):
-        monkeypatch.setenv("CXXFLAGS", f"{os.environ.get('CXXFLAGS', '')} -O0")
-    if room in ("adp", "deploy") and quick_cc is not None:
-        monkeypatch.setenv("CC", str(quick_cc))
-
-
 @pytest.fixture
 def record(request: pytest.FixtureRequest) -> Record:
     """Compares with what is recorded."""
     return Record(request)
-
-
-@pytest.fixture(autouse=True)
-def _no_trace_of_hydra(monkeypatch: pytest.MonkeyPatch) -> None:
-    """`main` sets this variable for Hydra; no test may see it from another one."""
-    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
-    assert "HYDRA_FULL_ERROR" not in os.environ

@@ -254,11 +254,11 @@ def tensors(module: nn.Module) -> dict[str, Tensor]:
 
 
 @over(MODULES)
-@pytest.mark.parametrize("how", ["float", "to"])
-def test_a_converted_module_computes_the_same_in_the_new_precision(name: str, how: str) -> None:
+def test_a_converted_module_computes_the_same_in_the_new_precision(name: str) -> None:
     case = MODULES[name]
     module, want = case.make(0.9), case.call(case.make(0.9), X).detach()
-    assert (module.float() if how == "float" else module.to(torch.float32)) is module
+    assert case.make(0.9).to(torch.float32).state_dict().keys() == module.state_dict().keys()
+    assert module.float() is module
     assert {t.dtype for t in tensors(module).values()} <= {torch.float32}
     got = case.call(module, X.float()).detach()
     assert got.dtype == (torch.float64 if case.constant else torch.float32)
@@ -298,13 +298,14 @@ def test_a_state_dict_carries_the_function_into_a_module_of_other_numbers(name: 
 
 
 @over(MODULES)
-@pytest.mark.parametrize("how", [copy.deepcopy, lambda module: pickle.loads(pickle.dumps(module))])
-def test_a_copy_is_the_same_function_and_shares_nothing(name: str, how: Callable[[Any], Any]) -> None:
+def test_a_copy_is_the_same_function_and_shares_nothing(name: str) -> None:
     case = MODULES[name]
     module = case.make(0.9)
-    twin, want = how(module), case.call(module, X).detach().clone()
-    assert torch.equal(case.call(twin, X), want)
+    twins = copy.deepcopy(module), pickle.loads(pickle.dumps(module))
+    want = case.call(module, X).detach().clone()
+    assert torch.equal(case.call(twins[0], X), want)
     with torch.no_grad():
         for held in tensors(module).values():
             held.fill_(torch.nan)
-    assert torch.equal(case.call(twin, X), want)
+    for twin in twins:
+        assert torch.equal(case.call(twin, X), want)

@@ -146,28 +146,21 @@ def anchors(path: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
-@pytest.mark.parametrize("path", PAGES, ids=name)
-def test_links_of_a_page_lead_somewhere(path: Path) -> None:
-    missing = [str(target) for target, _ in links(path) if not target.exists()]
-    assert missing == []
-    lost = [
-        f"{target}#{anchor}" for target, anchor in links(path) if anchor and anchor not in anchors(target)
-    ]
-    assert lost == []
+def test_links_of_all_pages_lead_somewhere() -> None:
+    for path in PAGES:
+        missing = [str(target) for target, _ in links(path) if not target.exists()]
+        assert missing == [], name(path)
+        lost = [f"{file}#{anchor}" for file, anchor in links(path) if anchor and anchor not in anchors(file)]
+        assert lost == [], name(path)
 
 
-@pytest.mark.parametrize("path", [README, *MANUALS], ids=name)
-def test_files_that_a_page_names_exist(path: Path) -> None:
-    text = re.sub(r"\]\([^()]*\)", "", read(path))  # links have a test of their own
-    named = re.findall(r"\b((?:tests|conf|staf_torch)/[\w./]*\w\.(?:py|md|yaml))\b", text)
-    assert [file for file in named if not (ROOT / file).exists()] == []
-
-
-@pytest.mark.parametrize("path", [README, *MANUALS], ids=name)
-def test_tests_that_a_page_names_exist(path: Path) -> None:
-    named = set(re.findall(r"`(test_\w+)`", read(path)))
+def test_files_and_tests_that_pages_name_exist() -> None:
     written = {test for file in (ROOT / "tests").rglob("test_*.py") for test in TEST.findall(read(file))}
-    assert named - written == set()
+    for path in (README, *MANUALS):
+        text = re.sub(r"\]\([^()]*\)", "", read(path))  # links have a test of their own
+        named = re.findall(r"\b((?:tests|conf|staf_torch)/[\w./]*\w\.(?:py|md|yaml))\b", text)
+        assert [file for file in named if not (ROOT / file).exists()] == [], name(path)
+        assert set(re.findall(r"`(test_\w+)`", text)) - written == set(), name(path)
 
 
 # --- commands -----------------------------------------------------------------------------------------------

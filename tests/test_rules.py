@@ -403,7 +403,7 @@ def test_every_call_with_a_rule_is_known_here() -> None:
 
 
 @pytest.mark.parametrize("rule", RULES, ids=str)
-def test_what_breaks_a_rule_is_refused_by_name(rule: Rule) -> None:
+def test_the_edge_of_a_rule_is_accepted_and_what_breaks_it_refused_by_name(rule: Rule) -> None:
     wrong = [
         value
         for value in WRONG[rule.kind]
@@ -415,10 +415,6 @@ def test_what_breaks_a_rule_is_refused_by_name(rule: Rule) -> None:
         named = re.escape(f"`{rule.call}({rule.argument}=...)` must ")
         with pytest.raises(ValueError, match=named):
             CALLS[rule.call](**{rule.argument: value})
-
-
-@pytest.mark.parametrize("rule", RULES, ids=str)
-def test_the_edge_of_a_rule_is_accepted(rule: Rule) -> None:
     edge = list(EDGE.get(rule.kind, ())) + list(rule.allowed)
     if rule.kind == "integer" and rule.least is not None and rule[:2] not in NOT_ALONE:
         edge.append(rule.least)

@@ -13,7 +13,7 @@ import pytest
 import torch
 from composing import settings
 from helpers import tensor, uniform
-from helpers_experiments import ran, run
+from helpers_experiments import ran, run, words
 
 from staf_torch import adp, systems
 from staf_torch.experiments import avoidance, faults, icl, safe_box
@@ -22,8 +22,6 @@ from staf_torch.experiments.study import Study
 from staf_torch.results.run_directory import RunDirectory
 
 KINDS = ("mass", "unicycle")
-IN_THE_BOX = "safe_box.states=4 safe_box.decay=20 safe_box.followed=0.01 safe_box.substeps=4 duration=0.02 "
-IN_THE_BOX += "dt=0.01 trajectories=2 adp.optimum.shooting=false figures=false"
 
 
 def test_a_study_has_a_row_metrics_and_a_line_a_method(
@@ -137,22 +135,21 @@ def test_gains_that_are_no_range_and_a_run_that_never_settles_are_refused(wrong:
 
 
 def test_in_the_box_only_the_policies_of_barrier_coordinates_stay_where_a_control_can(tmp_path: Path) -> None:
-    result = run(tmp_path, "experiment=safe_box", *IN_THE_BOX.split(), "adp.compile=false")
+    result = ran("safe_box")
     metrics = result.metrics
     assert metrics["constraint_violations"] == 0
     assert metrics["minimum_margin"] > 0.05
-    assert metrics["optimal_cost"] is None
     assert metrics["lqr_of_s_filtered_cost"] == pytest.approx(metrics["cost"], rel=1e-3)
     assert metrics["lqr_of_s_filtered_left_near_fraction"] == metrics["left_near_unavoidable_fraction"]
     assert metrics["lqr_of_s_filtered_renewed_left_near_fraction"] == 0
     assert metrics["left_unavoidable_fraction"] == 0
     assert metrics["lqr_of_x_filtered_cost"] == metrics["lqr_of_x_cost"]  # bit for bit: no wall is near
     assert len(result.rows("safe_box")) == 5
-    with np.load(tmp_path / "history.npz") as history:
-        assert history["state"].shape == history["barrier_state"].shape == (2, 3, 2)
+    with np.load(result.directory / "history.npz") as history:
+        assert history["state"].shape == history["barrier_state"].shape == (2, 6, 2)
         assert float(history["margin"].min()) == pytest.approx(metrics["minimum_margin"])
     with pytest.raises(ValueError, match=r"must lie strictly between the walls .* not so row 0"):
-        run(tmp_path, "experiment=safe_box", *IN_THE_BOX.split(), "safe_box.low=[-6,-5]")
+        run(tmp_path, *words("safe_box"), "safe_box.low=[-6,-5]")
 
 
 def test_every_method_in_the_box_pays_for_the_barrier_coordinates() -> None:
