@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import math
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -51,19 +52,19 @@ class FunctionPointers(ctypes.Structure):
         return cls(*pointers, float(functions.rate), reach), held
 
 
-class FilterCall(ctypes.Structure):
-    """`Call` of _filter.cpp."""
+class StreamsInC(ctypes.Structure):
+    """`Streams` of _filter.cpp."""
 
     _fields_ = (
         ("streams", ctypes.c_int64),
         ("stride", ctypes.c_int64),
-        ("mode", ctypes.c_int64),
-        *((name, ctypes.c_void_p) for name in ("table", "counts", "x", "y", "lapse", "ratio", "forgetting")),
-        ("mean", ctypes.c_void_p),
-        ("deviation", ctypes.c_void_p),
+        *((name, ctypes.c_void_p) for name in ("table", "counts", "ratio", "forgetting")),
         ("functions", FunctionPointers),
         *((name, ctypes.c_double) for name in ("slack2", "robust", "base", "tiny", "most")),
     )
+
+
+_packed = struct.Struct("6q").pack  # `Given` of _filter.cpp: what belongs to a call alone
 
 
 class CompiledFilter:
@@ -80,13 +81,11 @@ class CompiledFilter:
         ratio, forgetting = definition.ratio.contiguous(), definition.forgetting.contiguous()
         self._held += [state.blocks, state.counts, ratio, forgetting]
         streams = state.streams
-        self._call = FilterCall(streams=streams, stride=streams, functions=pointers)
-        self._call.table, self._call.counts = state.blocks.data_ptr(), state.counts.data_ptr()
-        self._call.ratio, self._call.forgetting = ratio.data_ptr(), forgetting.data_ptr()
-        self._call.slack2, self._call.robust = definition.slack**2, definition.robust
         numbers = torch.finfo(state.dtype)
-        self._call.base, self._call.tiny, self._call.most = definition.base, numbers.eps**0.5, numbers.max
-        self._run, self._pointer = call, ctypes.byref(self._call)
+        places = [each.data_ptr() for each in (state.blocks, state.counts, ratio, forgetting)]
+        law = definition.slack**2, definition.robust, definition.base, numbers.eps**0.5, numbers.max
+        self._streams = StreamsInC(streams, streams, *places, pointers, *law)
+        self._run, self._reference = call, ctypes.addressof(self._streams)
         self._shape = (streams, state.outputs)
 
     @classmethod
@@ -103,15 +102,10 @@ class CompiledFilter:
     def predict(self, state: StreamState, x: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of the next y at x (S, n), contiguous, of the table's dtype: (S, K)."""
         mean, deviation = x.new_empty(self._shape), x.new_empty(self._shape)
-        call = self._call
-        call.mode, call.x = 1, x.data_ptr()
-        call.mean, call.deviation = mean.data_ptr(), deviation.data_ptr()
-        self._run(self._pointer)
+        self._run(self._reference, _packed(1, x.data_ptr(), 0, 0, mean.data_ptr(), deviation.data_ptr()))
         return mean, deviation
 
     def learn(self, state: StreamState, x: Tensor, y: Tensor, lapse: Tensor | None = None) -> None:
         """Learn one sample a stream: (S, n), (S, K), contiguous and in the table's dtype; (S,) float64."""
-        call = self._call
-        call.mode, call.x, call.y = 2, x.data_ptr(), y.data_ptr()
-        call.lapse = None if lapse is None else lapse.data_ptr()
-        self._run(self._pointer)
+        time = 0 if lapse is None else lapse.data_ptr()
+        self._run(self._reference, _packed(2, x.data_ptr(), y.data_ptr(), time, 0, 0))

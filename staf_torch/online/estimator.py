@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from ..kernels import NAMED, Kernel
+from ..lanes.locks import ReadWriteLock
 from ..numerics.checks import choice, fail, integer
 from .samples import lapse_of, lapses, like_given, pair, tensor_of
 
@@ -154,6 +155,9 @@ class Streams(Protocol):
 class StreamEstimator(ScikitEstimator, abc.ABC):
     """Streams that learn and predict, whose sizes come with the first sample.
 
+    Threads may share one: any number of them predict at once, a sample is learned while nobody does, and
+    `fit` takes the place of what was learned when it has ended.
+
     Attributes:
         n_features_in_: n, from the first sample on.
         n_streams_: S, or None for a single stream without batch dimension.
@@ -162,6 +166,7 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         n_skipped_: samples that were not learned, () or (S,).
     """
 
+    __slots__ = ("_lock",)  # no part of what a copy or scikit-learn sees of an estimator
     n_features_in_: int
     n_streams_: int | None
     n_outputs_: int | None
@@ -169,6 +174,9 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
     _shape_: tuple[int, ...]  # of a sample's x
     _targets_: tuple[int, ...]  # of its y
     _dtype_: torch.dtype
+
+    def __init__(self) -> None:
+        self._lock = ReadWriteLock()
 
     @abc.abstractmethod
     def _begin(self, streams: int, outputs: int, like: Tensor) -> Streams:
@@ -190,11 +198,24 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
             ValueError: if a shape is another one.
         """
         states, values = pair(self._call("fit"), x, y, (2, 3))
-        lapse = lapses(self._call("fit"), time, states)
-        self.reset()
+        lapse, twin = lapses(self._call("fit"), time, states), self._twin()
         for k, (state, value) in enumerate(zip(states, values, strict=True)):
-            self._learn(state, value, None if lapse is None else lapse[k])
+            twin._learn(state, value, None if lapse is None else lapse[k])
+        self._lock.write(self._take_over, twin)
         return self
+
+    def _twin(self) -> Self:
+        """Return a regressor with the same arguments that has learned nothing."""
+        twin = type(self)(**self.get_params(deep=False))
+        twin._take_extra(self._extra_state())
+        return twin
+
+    def _take_over(self, twin: Self, state: dict[str, Any] | None = None) -> None:
+        """Go on with what another regressor with these arguments has learned, or has from a saved state."""
+        self._reset()
+        if state is not None:
+            self._take_extra(state)
+        vars(self).update({name: value for name, value in vars(twin).items() if name.endswith("_")})
 
     def partial_fit(self, x: Any, y: Any, lapse: Any = None) -> Self:
         """Learn from one sample a stream.
@@ -208,15 +229,19 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
             ValueError: if a shape is another one than at the first sample, or, at the first sample, an
                 argument of the constructor breaks its rule.
         """
+        self._lock.write(self._partial_fit, x, y, lapse)
+        return self
+
+    def _partial_fit(self, x: Any, y: Any, lapse: Any) -> None:
         if lapse is None and self._is_plain(x) and self._is_plain(y, target=True):
             self._streams_.learn(x, y)  # what compiled code reads as it is: nothing to convert or check
-            return self
+            return
         call = self._call("partial_fit")
         states, values = pair(call, x, y, (1, 2))
         steps = None if lapse is None else lapse_of(call, lapse, len(states) if states.dim() == 2 else 1)
-        return self._learn(states, values, steps)
+        self._learn(states, values, steps)
 
-    def _learn(self, states: Tensor, values: Tensor, lapse: Tensor | None) -> Self:
+    def _learn(self, states: Tensor, values: Tensor, lapse: Tensor | None) -> None:
         if not self.__sklearn_is_fitted__():
             self._prepare(states, values)
         streams = self._streams_
@@ -227,7 +252,6 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         if targets.shape[1] != (self.n_outputs_ or 1):
             raise self._refusal("partial_fit", states, values)
         streams.learn(rows, targets, None if lapse is None else lapse.expand(streams.count).contiguous())
-        return self
 
     def predict(self, x: Any, return_std: bool = False) -> Any:
         """Predict the next y at x, before it is learned.
@@ -243,6 +267,9 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         Raises:
             ValueError: before the first sample, or for another number of streams or dimensions.
         """
+        return self._lock.read(self._predict, x, return_std)
+
+    def _predict(self, x: Any, return_std: bool) -> Any:
         if self._is_plain(x):
             mean, deviation = self._streams_.predict(x)
             mean = mean.view(self._targets_)
@@ -299,47 +326,58 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
 
     def reset(self, streams: Any = None) -> Self:
         """Forget everything, dimension and streams included; or what these streams learned."""
+        self._lock.write(self._reset, streams)
+        return self
+
+    def _reset(self, streams: Any = None) -> None:
         if streams is not None:
             self._fitted("reset")._streams_.clear(self._numbers("reset", streams))
-            return self
+            return
         for name in [name for name in vars(self) if name.endswith("_")]:
             delattr(self, name)
-        return self
 
     def add(self, streams: int = 1) -> Self:
         """Begin further streams, numbered behind the others."""
+        self._lock.write(self._add, streams)
+        return self
+
+    def _add(self, streams: int) -> None:
         call = self._call("add")
         if self._fitted("add").n_streams_ is None:
             raise ValueError(f"`{call}` needs streams side by side, x (S, n); this is a single one.")
         self._streams_.add(integer(call, "streams", streams, least=1))
-        return self._resized()
+        self._resized()
 
     def drop(self, streams: Any) -> Self:
         """Give up the streams with these numbers; the others close ranks."""
+        self._lock.write(self._drop, streams)
+        return self
+
+    def _drop(self, streams: Any) -> None:
         gone = self._numbers("drop", streams)
         every = torch.arange(self._streams_.count)
         rows = every[~torch.isin(every, gone)]
         if self.n_streams_ is None or not len(rows):
             raise fail(self._call("drop"), "streams", "must leave a stream", streams)
         self._streams_.keep(rows)
-        return self._resized(rows)
+        self._resized(rows)
 
-    def _resized(self, kept: Tensor | None = None) -> Self:
+    def _resized(self, kept: Tensor | None = None) -> None:
         """Take over the count of streams after some were added, or after these alone were kept."""
         self.n_streams_ = self._streams_.count
         self._shape_ = (self._streams_.count, *self._shape_[1:])
         self._targets_ = (self._streams_.count, *self._targets_[1:])
-        return self
 
     @property
     def n_samples_seen_(self) -> Tensor:
-        return self._counted(self._streams_.learned)
+        return self._lock.read(self._counted, "learned")
 
     @property
     def n_skipped_(self) -> Tensor:
-        return self._counted(self._streams_.skipped)
+        return self._lock.read(self._counted, "skipped")
 
-    def _counted(self, count: Tensor) -> Tensor:
+    def _counted(self, name: str) -> Tensor:
+        count: Tensor = getattr(self._streams_, name).clone()
         return count.squeeze(0) if self.n_streams_ is None else count
 
     def _call(self, method: str) -> str:
@@ -355,6 +393,9 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
 
     def state_dict(self) -> dict[str, Any]:
         """Return all that was learned, as tensors, numbers and strings, which ``weights_only=True`` loads."""
+        return self._lock.read(self._state)
+
+    def _state(self) -> dict[str, Any]:
         about = {name: getattr(self._fitted("state_dict"), name) for name in _ABOUT}
         about |= {"dtype": str(self._dtype_), "arguments": self._plain_arguments()}
         return about | self._extra_state() | self._streams_.state_dict()
@@ -397,15 +438,18 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         x = torch.zeros(*leading, state["n_features_in_"], dtype=dtype)
         twin._prepare(x, x.new_zeros((*leading, *(() if outputs is None else (outputs,)))))
         twin._streams_.load_state_dict(state)
-        self.reset()
-        vars(self).update(vars(twin))
+        self._lock.write(self._take_over, twin, state)
         return self
 
     def __getstate__(self) -> dict[str, Any]:
-        learned = {"learned": self.state_dict()} if self.__sklearn_is_fitted__() else {}
+        return self._lock.read(self._whole)
+
+    def _whole(self) -> dict[str, Any]:
+        learned = {"learned": self._state()} if self.__sklearn_is_fitted__() else {}
         return self.get_params(deep=False) | self._extra_state() | learned
 
     def __setstate__(self, state: dict[str, Any]) -> None:
+        self._lock = ReadWriteLock()
         learned = state.pop("learned", None)
         vars(self).update({name: state[name] for name in _parameters(type(self))})
         self._take_extra(state)

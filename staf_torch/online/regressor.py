@@ -102,6 +102,7 @@ class StaFRegressor(StreamEstimator):
         robust: float | None = None,
         scaling: bool = False,
     ) -> None:
+        super().__init__()
         self.kernel = kernel
         self.radius = radius
         self.count = count
@@ -135,11 +136,14 @@ class StaFRegressor(StreamEstimator):
         """
         states, values = pair(f"{_NAME}.tune", x, y, (2, 3))
         states = turned_in_time(states, self._angles(states.shape[-1]))
-        self.reset()
         targets = values if values.dim() == states.dim() else values.unsqueeze(-1)
         rows = [part.unsqueeze(1) if states.dim() == 2 else part for part in (states, targets)]
-        self._tuning = tuning(rows[0], rows[1], self._directions(states.shape[-1]))
+        self._lock.write(self._hold, tuning(rows[0], rows[1], self._directions(states.shape[-1])))
         return self
+
+    def _hold(self, found: Tuning) -> None:
+        self._reset()
+        self._tuning = found
 
     def smooth(self, x: Any, y: Any, time: Any = None) -> tuple[Any, Any]:
         """Estimate V at recorded states from the samples before and after each: the filter and back again.
@@ -155,7 +159,7 @@ class StaFRegressor(StreamEstimator):
         """
         states, values = pair(f"{_NAME}.smooth", x, y, (2, 3))
         states = turned_in_time(states, self._angles(states.shape[-1]))
-        steps, twin = lapses(f"{_NAME}.smooth", time, states), copy.copy(self).reset()
+        steps, twin = lapses(f"{_NAME}.smooth", time, states), self._twin()
         twin._prepare(states[0], values[0])
         streams = twin._streams_.inner if isinstance(twin._streams_, TurningStreams) else twin._streams_
         assert isinstance(streams, FilterStreams)
@@ -236,13 +240,12 @@ class StaFRegressor(StreamEstimator):
             return ("count", "follow", "robust")
         return ("radius", "count", "noise", "amplitude", "forgetting", "follow", "robust", "scaling")
 
-    def _resized(self, kept: Tensor | None = None) -> Self:
+    def _resized(self, kept: Tensor | None = None) -> None:
         before = self.n_streams_ or 1
         super()._resized()
         if self._tuning is not None:
             new = self._streams_.count - before
             self._tuning = self._tuning.add(new) if kept is None else self._tuning.keep(kept)
-        return self
 
     def _extra_state(self) -> dict[str, Any]:
         extra: dict[str, Any] = {} if self._tuning is None else {"tuning": self._tuning._asdict()}

@@ -65,11 +65,11 @@ def test_compiled_bank_chooses_what_the_definition_does() -> None:
         slow.table.copy_(fast.table)
         fast.learn(x.contiguous(), y.contiguous())
     slow.learn(s.at[-1:], s.y[-1:])
-    found, expected = (bank.definition.each(bank.table)[0] for bank in (fast, slow))
+    found, expected = (bank.definition.each(bank.table, bank.answers)[0] for bank in (fast, slow))
     for name in ("tracker_rate", "tracker_noise", "tracker_forgetting", "metric"):
         torch.testing.assert_close(found[name], expected[name], rtol=1e-6, atol=1e-9)
     lanes = [TURNED, PLAIN, FADING, TURNED_FADING]
-    at_first = Bank(shape, 1, True).definition.each(fast.table.clone())[0]
+    at_first = Bank(shape, 1, True).definition.each(fast.table.clone(), fast.answers)[0]
     fast.definition.clear(at_first)
     changed = found["tracker_rate"] != at_first["tracker_rate"]
     assert changed[lanes].all()

@@ -15,7 +15,20 @@ from ..kalman_filter import ERROR_RATE, STREAK, LocalFilter, StreamState, spread
 from ..local_functions import LocalFunctions
 from .members import QuadraticModels, Stretch, TrackerModels, learn_hyperparameters, quadratic_features
 from .mixing import constant, judge, mix
-from .rules import FADING, GROUPS, PLAIN, SEARCHED, TRACKERS, TURNED, TURNED_FADING, BankShape, Rules, parts
+from .rules import (
+    FADING,
+    GROUPS,
+    PLAIN,
+    SEARCHED,
+    TRACKERS,
+    TURNED,
+    TURNED_FADING,
+    BankShape,
+    Rules,
+    answer_layout,
+    layout,
+    parts,
+)
 
 _RESET = ("skipped", "learned")  # what a stream that begins anew keeps
 JUDGED = 2  # the local process by whose unknown share x is away from the samples
@@ -42,9 +55,10 @@ class BankDefinition:
         self.prior = torch.tensor(rules.quadratic_prior, dtype=torch.float64)
         self.filter = LocalFilter(functions, ratio, forgetting, rules.carried_slack)
 
-    def each(self, table: Tensor) -> list[Views]:
-        """Return the streams of a table."""
-        return [parts(self.shape, row) for row in table]
+    def each(self, table: Tensor, answers: Tensor) -> list[Views]:
+        """Return the streams of a table (S, size), with their latest answers (S, size of one)."""
+        own, answer = layout(self.shape), answer_layout(self.shape)
+        return [parts(own, row) | parts(answer, of) for row, of in zip(table, answers, strict=True)]
 
     def clear(self, s: Views) -> None:
         """Begin anew."""
@@ -52,7 +66,6 @@ class BankDefinition:
             if name not in _RESET:
                 part.zero_()
         s["last_x"].fill_(torch.nan)
-        s["asked"].fill_(torch.nan)
         for name in ("spread", "excess", "error", "pace", "own", "best", "calibration", "quadratic_error"):
             s[name].fill_(1.0)
         s["correction_covariance"].copy_(self.rules.correction_prior * torch.eye(GROUPS, dtype=torch.float64))
@@ -94,17 +107,17 @@ class BankDefinition:
         x = torch.where(torch.isnan(x), s["last_x"], x)
         if float(s["count"]) == 0:
             return torch.zeros_like(s["mean"]), torch.ones_like(s["mean"])
-        self._ask(s, x)
+        self._ask(s, x, s["time"])
         center, spread = (part[self.shape.dim :] for part in self._units(s))
         return s["mean"] * spread + center, s["variance"].sqrt() * spread
 
-    def _ask(self, s: Views, x: Tensor) -> None:
-        """Store the prediction of every member at x, and their mixture."""
+    def _ask(self, s: Views, x: Tensor, now: Tensor) -> None:
+        """Store the prediction of every member at x and a time, and their mixture."""
         r, n = self.rules, self.shape.dim
         center, spread = self._units(s)
         u = torch.cat((torch.ones(1, dtype=torch.float64), (x - center[:n]) / spread[:n]))
         line = (s["linear"] * u).sum(-1)
-        process = self._local_processes(s, x, u[1:], line)
+        process = self._local_processes(s, x, now, u[1:], line)
         carried = self.filter.predict(self._filters(s), u[1:].expand(len(r.carried_forgetting), -1))
         latest = s["waiting_y" if float(s["waiting"]) == 1 else "last_y"]
         last = ((latest - center[n:]) / spread[n:])[:, None]
@@ -140,7 +153,9 @@ class BankDefinition:
     def _apart(self, s: Views, a: Tensor, b: Tensor) -> Tensor:
         return ((a - b) / self._units(s)[1][: self.shape.dim]).square().sum(-1)
 
-    def _local_processes(self, s: Views, x: Tensor, u: Tensor, line: Tensor) -> tuple[Tensor, Tensor]:
+    def _local_processes(
+        self, s: Views, x: Tensor, now: Tensor, u: Tensor, line: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Means and variances of the 24 local processes of what the linear model leaves: (K, 24), (K, 24)."""
         r, n, count = self.rules, self.shape.dim, int(float(s["count"]))
         latest = s["order"][:count].argsort(descending=True)
@@ -148,7 +163,7 @@ class BankDefinition:
         center, spread = self._units(s)
         most = min(self.shape.neighbours, count)
         sides, rests = [], []
-        when = torch.cat((s["when"][nearest[:most]], s["time"][None]))
+        when = torch.cat((s["when"][nearest[:most]], now[None]))
         ages = (when[:, None] - when[None]).abs()
         for chosen in (nearest[:most], latest[:most]):
             at = (s["x"][chosen] - center[:n]) / spread[:n]
@@ -260,23 +275,25 @@ class BankDefinition:
         """Learn one sample: (n,), (K,)."""
         x = torch.where(torch.isnan(given), s["last_x"], given)
         repeats = torch.equal(x, s["last_x"])
+        seen, known = ~torch.isnan(told), float(s["count"]) > 0
+        sound = torch.isfinite(x).all() & seen.any() & ~torch.isnan(given).all() & ~torch.isinf(told).any()
+        asked = float(s["answered"]) and float(s["unlearned"]) == 0 and bool((x == s["asked"]).all())
+        # judged is what was to be expected right after the sample before, whether or not somebody has asked
+        if known and bool(sound) and not asked:
+            self._ask(s, x, s["time"] - s["unlearned"])
+        for name in ("answered", *(() if known else ("mean",))):
+            s[name].zero_()
         s["last_x"].copy_(torch.where(given.abs() < 1e150, given, s["last_x"]))
         for name in ("time", "unlearned"):
             s[name].add_(lapse)
-        seen = ~torch.isnan(told)
-        sound = torch.isfinite(x).all() & seen.any() & ~torch.isnan(given).all() & ~torch.isinf(told).any()
         if not bool(sound):
             s["skipped"].add_(1)
             return
-        known = float(s["count"]) > 0
-        if known and not (float(s["answered"]) and bool((x == s["asked"]).all())):
-            self._ask(s, x)
         center, spread = (part[self.shape.dim :] for part in self._units(s))
         # the first value of an output says nothing of predictions
         first = seen & (s["low"] == torch.inf) & (told.abs() < 1e150) & known
         judged = seen & ~first
         y = torch.where(judged, told, s["mean"] * spread + center)
-        s["answered"].zero_()
         s["far"].copy_(s["far"] + 1 if self._beyond(s, x, y) else 0 * s["far"])
         if float(s["far"]) >= STREAK:  # the stream has gone elsewhere for good
             time = s["time"].clone()

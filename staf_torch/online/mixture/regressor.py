@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import math
+import struct
 from collections.abc import Callable
 from typing import Any, Self
 
@@ -29,6 +30,8 @@ from .rules import (
     TRACKED,
     BankShape,
     Rules,
+    answer_layout,
+    layout,
     refuse_unwritten,
     size,
 )
@@ -42,14 +45,13 @@ class RulesInC(ctypes.Structure):
     _fields_ = (("numbers", ctypes.c_double * _NUMBERS), ("functions", FunctionPointers))
 
 
-class BankCall(ctypes.Structure):
-    """`Call` of _bank.cpp."""
+class BankStreams(ctypes.Structure):
+    """`Streams` of _bank.cpp."""
 
-    _fields_ = (
-        ("streams", ctypes.c_int64),
-        ("mode", ctypes.c_int64),
-        *((name, ctypes.c_void_p) for name in ("table", "x", "y", "lapse", "mean", "deviation", "rules")),
-    )
+    _fields_ = (("count", ctypes.c_int64), ("table", ctypes.c_void_p), ("rules", ctypes.c_void_p))
+
+
+_packed = struct.Struct("7q").pack  # `Call` of _bank.cpp: what belongs to a call alone
 
 
 class Bank:
@@ -98,10 +100,10 @@ class Bank:
         rules = Rules.of(shape.dim, scaling, doubtful)
         pointers, self._held = FunctionPointers.of(functions)
         self._rules = RulesInC((ctypes.c_double * _NUMBERS)(*rules.numbers()), pointers)
-        self._call, self._run = BankCall(), _built(shape) if compile else None
+        self._run = _built(shape) if compile else None
         self.compiled = self._run is not None  # and not the definition
         self.definition = BankDefinition(shape, rules, functions)
-        self.table = torch.zeros(0, size(shape), dtype=torch.float64)
+        self.table = torch.zeros(0, size(layout(shape)), dtype=torch.float64)
         self.add(streams)
 
     def add(self, streams: int) -> None:
@@ -113,15 +115,20 @@ class Bank:
     def replace(self, table: Tensor) -> None:
         """Hold these streams, (S, size), instead."""
         self.table = table.contiguous()
-        self._call.streams, self._call.table = len(table), self.table.data_ptr()
-        self._call.rules = ctypes.addressof(self._rules)
+        self._streams = BankStreams(len(table), self.table.data_ptr(), ctypes.addressof(self._rules))
+        self._reference = ctypes.addressof(self._streams)
+        self._forget_answers()
+
+    def _forget_answers(self) -> None:
+        self.answers = self.table.new_zeros(len(self.table), size(answer_layout(self.shape)))
 
     def clear(self, rows: Tensor) -> None:
         """Let the streams with these numbers begin anew."""
         part = self.table.new_zeros(len(rows), self.table.shape[1])  # what was counted included
-        for stream in self.definition.each(part):
+        for stream in self.definition.each(part, self.answers[rows]):
             self.definition.clear(stream)
         self.table[rows] = part
+        self._forget_answers()
 
     @property
     def count(self) -> int:
@@ -144,7 +151,7 @@ class Bank:
                 compiled code goes by them.
         """
         table = table_of(state)
-        refuse_other({"table": table}, {"table": self.table}, size(self.shape), table.shape[1])
+        refuse_other({"table": table}, {"table": self.table}, self.table.shape[1], table.shape[1])
         refuse_unwritten(self.shape, table)
         self.replace(table.clone())
 
@@ -159,29 +166,32 @@ class Bank:
         return self.table[:, 3].long()
 
     def predict(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation of the next y at x (S, n), contiguous float64: (S, K), (S, K)."""
+        """Mean and standard deviation of the next y at x (S, n), contiguous float64: (S, K), (S, K).
+
+        Nothing of the streams changes. The answers are kept: who learns at this x need not ask again.
+        """
         shape = len(self.table), self.shape.outputs
-        mean, deviation = x.new_empty(shape), x.new_empty(shape)
+        mean, deviation, answers = x.new_empty(shape), x.new_empty(shape), torch.empty_like(self.answers)
         if self._run is None:
-            for i, stream in enumerate(self.definition.each(self.table)):
+            for i, stream in enumerate(self.definition.each(self.table, answers.zero_())):
                 mean[i], deviation[i] = self.definition.predict(stream, x[i])
-            return mean, deviation
-        call = self._call
-        call.mode, call.x, call.mean, call.deviation = 1, x.data_ptr(), mean.data_ptr(), deviation.data_ptr()
-        self._run(ctypes.byref(call))
+        else:
+            places = x.data_ptr(), 0, 0, mean.data_ptr(), deviation.data_ptr(), answers.data_ptr()
+            self._run(self._reference, _packed(1, *places))
+        self.answers = answers
         return mean, deviation
 
     def learn(self, x: Tensor, y: Tensor, lapse: Tensor | None = None) -> None:
         """Learn one sample a stream: (S, n), (S, K), contiguous float64; time since the last sample, (S,)."""
         if self._run is None:
             lapses = [1.0] * len(x) if lapse is None else lapse.tolist()
-            for s, *sample in zip(self.definition.each(self.table), x, y, lapses, strict=True):
+            streams = self.definition.each(self.table, self.answers)
+            for s, *sample in zip(streams, x, y, lapses, strict=True):
                 self.definition.learn(s, *sample)
             return
-        call = self._call
-        call.mode, call.x, call.y = 2, x.data_ptr(), y.data_ptr()
-        call.lapse = None if lapse is None else lapse.data_ptr()
-        self._run(ctypes.byref(call))
+        time = 0 if lapse is None else lapse.data_ptr()
+        places = x.data_ptr(), y.data_ptr(), time, 0, 0, self.answers.data_ptr()
+        self._run(self._reference, _packed(2, *places))
 
 
 @functools.cache
@@ -233,6 +243,7 @@ class MixtureRegressor(StreamEstimator):
     def __init__(
         self, memory: int = 1000, neighbours: int = 56, *, robust: float | None = None, scaling: bool = True
     ) -> None:
+        super().__init__()
         self.memory = memory
         self.neighbours = neighbours
         self.robust = robust

@@ -128,7 +128,7 @@ def layout(shape: BankShape) -> list[tuple[str, tuple[int, ...]]]:
     filters = rows_of(n, n + 1, k) + 1
     return [
         *((name, ()) for name in ("clock", "count", "far", "skipped", "learned", "time")),
-        *(("last_x", (n,)), ("last_y", (k,)), ("asked", (n,)), ("answered", ())),
+        *(("last_x", (n,)), ("last_y", (k,))),
         *((name, ()) for name in ("waiting", "trust", "doubted", "waiting_time", "waiting_lapse")),
         *(("waiting_x", (n,)), ("waiting_y", (k,))),  # an unexpected sample, until the next one tells
         *(("center", (n + k,)), ("spread", (n + k,))),
@@ -149,24 +149,33 @@ def layout(shape: BankShape) -> list[tuple[str, tuple[int, ...]]]:
         *(
             (name, (k,)) for name in ("level", "wide", "leaps", "told")
         ),  # mean and spread of y: see `spread_with`
-        *(("weight", (k,)), ("surprises", (k,))),  # of the variance, what the errors say; surprises in a row
-        *(("unknown", ()), ("usual_unknown", ())),  # share of the variance of a local process, and its mean
+        ("surprises", (k,)),  # in a row
+        ("usual_unknown", ()),  # running share of the variance of a local process that is unknown
         *(("correction_covariance", (k, GROUPS, GROUPS)), ("correction", (k, GROUPS))),  # coefficients
-        ("away", (k, GROUPS)),  # of the groups from the mixture, in running errors
         ("corrected", (k, BLENDS)),  # logarithms of the weights of the four mixtures
         ("map", (k, 2, KNOTS)),  # corrections, and what is known of them
-        *((name, (k, MEMBERS)) for name in ("means", "variances")),
-        *((name, (k, CLOCKS)) for name in ("mixed", "mixed_variance")),
-        ("blend", (k, BLENDS)),  # the mixture, the corrected one, that by squares, what the map makes of them
-        *(("straight", (k,)), ("mean", (k,)), ("variance", (k,))),  # straight: the mean without the map
         *(("x", (c, n)), ("y", (c, k)), *((name, (c,)) for name in ("when", "order", "gap"))),
         ("unlearned", ()),  # time that has passed in samples that were skipped
     ]
 
 
-def parts(shape: BankShape, table: Tensor) -> dict[str, Tensor]:
+def answer_layout(shape: BankShape) -> list[tuple[str, tuple[int, ...]]]:
+    """Return names and shapes of a stream's answer to one question, in the order of `Answer` in _bank.hpp."""
+    n, k = shape.dim, shape.outputs
+    return [
+        *(("asked", (n,)), ("answered", ())),  # where, and whether the stream is still as it was then
+        ("unknown", ()),  # share of the variance of a local process
+        ("weight", (k,)),  # of the variance, what the errors say
+        ("away", (k, GROUPS)),  # of the groups from the mixture, in running errors
+        *((name, (k, MEMBERS)) for name in ("means", "variances")),
+        *((name, (k, CLOCKS)) for name in ("mixed", "mixed_variance")),
+        ("blend", (k, BLENDS)),  # the mixture, the corrected one, that by squares, what the map makes of them
+        *(("straight", (k,)), ("mean", (k,)), ("variance", (k,))),  # straight: the mean without the map
+    ]
+
+
+def parts(fields: list[tuple[str, tuple[int, ...]]], table: Tensor) -> dict[str, Tensor]:
     """Return views of the numbers of streams (..., size) by name, (..., *dims)."""
-    fields = layout(shape)
     split = table.split([math.prod(dims) for _, dims in fields], dim=-1)
     return {
         name: part.unflatten(-1, dims) if dims else part.squeeze(-1)
@@ -174,9 +183,9 @@ def parts(shape: BankShape, table: Tensor) -> dict[str, Tensor]:
     }
 
 
-def size(shape: BankShape) -> int:
+def size(fields: list[tuple[str, tuple[int, ...]]]) -> int:
     """Return the count of numbers a stream."""
-    return sum(math.prod(dims) for _, dims in layout(shape))
+    return sum(math.prod(dims) for _, dims in fields)
 
 
 def refuse_unwritten(shape: BankShape, table: Tensor) -> None:
@@ -185,7 +194,7 @@ def refuse_unwritten(shape: BankShape, table: Tensor) -> None:
     Raises:
         ValueError: where a number of samples or a place is out of range, or a sample is not finite.
     """
-    named = parts(shape, table)
+    named = parts(layout(shape), table)
     count, turns = named["count"], named["tracker_counts"][:, -1]
     rules = {
         f"a number of samples from 0 to {shape.capacity}": (count >= 0) & (count <= shape.capacity),

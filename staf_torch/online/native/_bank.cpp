@@ -5,12 +5,16 @@
 
 #include <cstring>
 
-struct Call {
-    int64_t streams, mode;  // 1 to predict, 2 to learn
-    double *table;          // of rows that began with zeros and were cleared
-    const double *x, *y, *lapse;  // (streams, n), (streams, K), (streams)
-    double *mean, *deviation;     // (streams, K)
+struct Streams {
+    int64_t count;
+    double *table;  // of rows that began with zeros and were cleared
     const Rules *rules;
+};
+struct Call {  // what belongs to a call alone: another thread may ask the same streams
+    int64_t mode;                 // 1 to predict, 2 to learn
+    const double *x, *y, *lapse;  // (count, n), (count, K), (count)
+    double *mean, *deviation;     // (count, K)
+    double *answers;              // of the streams as they are, to what was asked last
 };
 
 static Filter filters_of(const Stream &s) {
@@ -61,7 +65,6 @@ static void clear(const Rules &r, Stream &s) {
     std::memset(&s, 0, sizeof s);
     s.skipped = skipped, s.learned = learned;
     std::fill(s.last_x, s.last_x + n, NAN);
-    std::fill(s.asked, s.asked + n, NAN);
     std::fill(s.spread, s.spread + n + K, 1);
     std::fill(s.order, s.order + C, -1);
     std::fill(s.gap, s.gap + C, infinity);
@@ -212,8 +215,8 @@ static void rescale(const Rules &r, Stream &s) {
     }
 }
 
-// What every member says at x, and their mixture.
-static void ask(const Rules &r, Stream &s, const double *x) {
+// What every member says at x and a time, and their mixture.
+static void ask(const Rules &r, const Stream &s, double now, const double *x, Answer &a) {
     double u[unknowns] = {1}, line[K], spread = 1;
     scaled(r, s, x, u + 1);
     for (int o = 0; o < K; ++o) {
@@ -222,7 +225,7 @@ static void ask(const Rules &r, Stream &s, const double *x) {
     }
     for (int i = 0; i < unknowns; ++i)
         for (int j = 0; j < unknowns; ++j) spread += u[i] * s.covariance[i][j] * u[j];
-    local_processes(r, s, x, u + 1, line);
+    local_processes(r, s, now, x, u + 1, line, a);
     V at[n], place[n], mean[K], deviation[K], bent[K], tracked[K];
     double phi[features];
     quadratic_features(u + 1, phi);
@@ -234,7 +237,7 @@ static void ask(const Rules &r, Stream &s, const double *x) {
     const Filter f = filters_of(s);
     predict(r.functions, law_of(r), f, [&](int i) { return f.learned[i]; }, at, mean, deviation);
     for (int o = 0; o < K; ++o) {
-        double *means = s.means[o], *variances = s.variances[o];
+        double *means = a.means[o], *variances = a.variances[o];
         for (int l = 0; l < carried; ++l) means[locals + l] = mean[o][l], variances[locals + l] = square(deviation[o][l]);
         for (int l = 0; l < lanes; ++l) {
             means[locals + carried + l] = bent[o][l];
@@ -252,10 +255,10 @@ static void ask(const Rules &r, Stream &s, const double *x) {
             means[i] = std::min(std::max(means[i], low - wide), high + wide);
             if (!(variances[i] < 1e300)) variances[i] = 1e300;
         }
-        mix(r, s, o, low - wide, high + wide);
+        mix(r, s, o, low - wide, high + wide, a);
     }
-    std::copy(x, x + n, s.asked);
-    s.answered = 1;
+    std::copy(x, x + n, a.asked);
+    a.answered = 1;
 }
 
 // Keep (x, y). A full store gives up the older of the closest pair of those that are not recent.
@@ -324,12 +327,13 @@ static void accept(const Rules &r, Stream &s, const double *x, const double *y, 
 }
 
 // Whether a sample that nobody expected waits: it is learned if the next one is as far off, else skipped.
-static bool waits(const Rules &r, Stream &s, const double *x, const double *y, const double *told, double &lapse) {
+static bool waits(const Rules &r, Stream &s, const Answer &a, const double *x, const double *y, const double *told,
+                  double &lapse) {
     bool doubtful = false;
     for (int o = 0; o < K; ++o) {
-        const double error = std::fabs(in_units(r, s, o, y[o]) - s.mean[o]);
+        const double error = std::fabs(in_units(r, s, o, y[o]) - a.mean[o]);
         const double most = error > r.outside ? r.doubtful_outside : r.doubtful;
-        doubtful |= told[o] == told[o] && square(error) > square(most) * std::max(s.variance[o], s.pace[o]);
+        doubtful |= told[o] == told[o] && square(error) > square(most) * std::max(a.variance[o], s.pace[o]);
     }
     const bool waiting = s.waiting, rare = s.doubted < r.rare;
     s.doubted += r.doubted_rate * (doubtful - s.doubted);
@@ -351,7 +355,7 @@ static bool waits(const Rules &r, Stream &s, const double *x, const double *y, c
     return false;
 }
 
-static void learn(const Rules &r, Stream &s, const double *given, const double *told, double lapse) {
+static void learn(const Rules &r, Stream &s, Answer &a, const double *given, const double *told, double lapse) {
     double x[n], y[K], judged[K];
     bool first[K], seen[K], anew = false;  // the first value of an output says nothing of predictions
     bool some = false, measured = false, sound = true;
@@ -359,22 +363,25 @@ static void learn(const Rules &r, Stream &s, const double *given, const double *
     for (int i = 0; i < n; ++i) measured |= given[i] == given[i];
     bool repeats = std::equal(x, x + n, s.last_x);
     for (int o = 0; o < K; ++o) some |= told[o] == told[o], sound &= !std::isinf(told[o]);
+    const bool known = s.count > 0, learns = sound && some && measured;
+    // Judged is what was to be expected right after the sample before, whether or not somebody has asked for it.
+    if (!known) a = Answer{};
+    else if (learns && !(a.answered && s.unlearned == 0 && std::equal(x, x + n, a.asked)))
+        ask(r, s, s.time - s.unlearned, x, a);
+    a.answered = 0;
     for (int i = 0; i < n; ++i)
         if (std::isfinite(given[i]) && std::fabs(given[i]) < 1e150) s.last_x[i] = given[i];
     s.time += lapse, s.unlearned += lapse;
-    if (!sound || !some || !measured) {
+    if (!learns) {
         s.skipped += 1;
         return;
     }
-    const bool known = s.count > 0;
-    if (known && !(s.answered && std::equal(x, x + n, s.asked))) ask(r, s, x);
     for (int o = 0; o < K; ++o) {
         seen[o] = told[o] == told[o];
         first[o] = known && seen[o] && s.low[o] == infinity && std::fabs(told[o]) < 1e150;
         judged[o] = first[o] ? NAN : told[o];
-        y[o] = seen[o] && !first[o] ? told[o] : s.mean[o] * scale_of(r, s, n + o) + shift_of(r, s, n + o);
+        y[o] = seen[o] && !first[o] ? told[o] : a.mean[o] * scale_of(r, s, n + o) + shift_of(r, s, n + o);
     }
-    s.answered = 0;
     s.far = beyond(r, s, x, y) ? s.far + 1 : 0;
     if (s.far >= streak_limit) {  // the stream has gone elsewhere for good
         const double time = s.time;
@@ -386,11 +393,11 @@ static void learn(const Rules &r, Stream &s, const double *given, const double *
     } else if (s.far > 0) s.skipped += 1;
     else if (known) {
         lapse = s.unlearned, s.unlearned = 0;
-        if (waits(r, s, x, y, judged, lapse)) return;
-        s.usual_unknown += std::max(error_rate, 1 / std::max(s.clock - 1, 1.)) * (s.unknown - s.usual_unknown);
+        if (waits(r, s, a, x, y, judged, lapse)) return;
+        s.usual_unknown += std::max(error_rate, 1 / std::max(s.clock - 1, 1.)) * (a.unknown - s.usual_unknown);
         for (int o = 0; o < K; ++o)  // a sample that repeats the last one says nothing of errors
             if (judged[o] == judged[o] && !(repeats && y[o] == s.last_y[o] && !constant(s, o)))
-                judge_members(r, s, o, in_units(r, s, o, y[o]));
+                judge_members(r, s, a, o, in_units(r, s, o, y[o]));
     }
     if (s.far > 0) return;
     s.unlearned = 0;
@@ -403,23 +410,24 @@ static void learn(const Rules &r, Stream &s, const double *given, const double *
     accept(r, s, x, y, s.time, lapse, anew);
 }
 
-static void tell(const Rules &r, Stream &s, const double *given, double *mean, double *deviation) {
+static void tell(const Rules &r, const Stream &s, Answer &a, const double *given, double *mean, double *deviation) {
     double x[n];
     for (int i = 0; i < n; ++i) x[i] = given[i] == given[i] ? given[i] : s.last_x[i];
-    if (s.count > 0) ask(r, s, x);
+    if (s.count > 0) ask(r, s, s.time, x, a);
+    else a = Answer{};
     for (int o = 0; o < K; ++o) {
         const double scale = scale_of(r, s, n + o);
-        mean[o] = s.count > 0 ? s.mean[o] * scale + shift_of(r, s, n + o) : 0;
-        deviation[o] = s.count > 0 ? std::sqrt(s.variance[o]) * scale : 1;
+        mean[o] = s.count > 0 ? a.mean[o] * scale + shift_of(r, s, n + o) : 0;
+        deviation[o] = s.count > 0 ? std::sqrt(a.variance[o]) * scale : 1;
     }
 }
 
-extern "C" void staf_bank(const Call *call) {
-    Stream *streams = reinterpret_cast<Stream *>(call->table);
-    for (int64_t i = 0; i < call->streams; ++i) {
-        Stream &s = streams[i];
-        if (call->mode & 1) tell(*call->rules, s, call->x + i * n, call->mean + i * K, call->deviation + i * K);
-        if (call->mode & 2)
-            learn(*call->rules, s, call->x + i * n, call->y + i * K, call->lapse ? call->lapse[i] : 1);
+extern "C" void staf_bank(const Streams *streams, const Call *call) {
+    const Rules &r = *streams->rules;
+    for (int64_t i = 0; i < streams->count; ++i) {
+        Stream &s = reinterpret_cast<Stream *>(streams->table)[i];
+        Answer &a = reinterpret_cast<Answer *>(call->answers)[i];
+        if (call->mode & 1) tell(r, s, a, call->x + i * n, call->mean + i * K, call->deviation + i * K);
+        if (call->mode & 2) learn(r, s, a, call->x + i * n, call->y + i * K, call->lapse ? call->lapse[i] : 1);
     }
 }

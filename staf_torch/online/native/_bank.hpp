@@ -25,7 +25,7 @@ struct Rules {  // in the order of mixture/rules.py, which says what they are
 
 struct Stream {  // the row of a stream in the table of mixture/rules.py
     double clock, count, far, skipped, learned, time;
-    double last_x[n], last_y[K], asked[n], answered;
+    double last_x[n], last_y[K];
     double waiting, trust, doubted, waiting_time, waiting_lapse, waiting_x[n], waiting_y[K];
     double center[n + K], spread[n + K];
     double covariance[unknowns][unknowns], linear[K][unknowns];
@@ -39,15 +39,19 @@ struct Stream {  // the row of a stream in the table of mixture/rules.py
     double squares[K][members];
     double error[K], pace[K], own[K], best[K], low[K], high[K], calibration[K];
     double level[K], wide[K], leaps[K], told[K];  // mean and spread of y
-    double weight[K], surprises[K];  // of the variance, what the errors say; surprises in a row
-    double unknown, usual_unknown;   // share of the variance of a local process, and its running mean
+    double surprises[K];   // in a row
+    double usual_unknown;  // running share of the variance of a local process that is unknown
     double correction_covariance[K][groups_of_members][groups_of_members], correction[K][groups_of_members];
-    double away[K][groups_of_members], corrected[K][blends];
+    double corrected[K][blends];
     double map[K][2][knots];  // corrections, and what is known of them
-    double means[K][members], variances[K][members], mixed[K][clocks], mixed_variance[K][clocks];
-    double blend[K][blends], straight[K], mean[K], variance[K];
     double x[C][n], y[C][K], when[C], order[C], gap[C];
     double unlearned;  // time that has passed in samples that were skipped
+};
+
+struct Answer {  // of a stream to a question, see mixture/rules.py: it belongs to who asks
+    double asked[n], answered, unknown, weight[K], away[K][groups_of_members];
+    double means[K][members], variances[K][members], mixed[K][clocks], mixed_variance[K][clocks];
+    double blend[K][blends], straight[K], mean[K], variance[K];
 };
 
 static double square(double a) { return a * a; }
@@ -95,7 +99,8 @@ static int choose(const Rules &r, const Stream &s, const double *x, int chosen[s
 }
 
 // The local Gaussian processes of what the linear model leaves: means and variances at x, in units.
-static void local_processes(const Rules &r, Stream &s, const double *x, const double *u, const double *line) {
+static void local_processes(const Rules &r, const Stream &s, double now, const double *x, const double *u,
+                            const double *line, Answer &found) {
     int chosen[sides][near];
     const int count = choose(r, s, x, chosen);
     double at[sides][near + 1][n], when[near + 1], rest[sides][K][near];
@@ -112,7 +117,7 @@ static void local_processes(const Rules &r, Stream &s, const double *x, const do
         }
         std::copy(u, u + n, at[h][count]);
     }
-    when[count] = s.time;
+    when[count] = now;
     static thread_local V gram[groups][near + 1][near + 1];
     const double *w = r.width_rates, *f = r.fade_rates;
     const V exponents = -V{w[0], w[1], w[2], w[0], w[1], w[2], f[0], f[1]};  // nearest, latest, by age
@@ -154,7 +159,7 @@ static void local_processes(const Rules &r, Stream &s, const double *x, const do
                 amplitude[o] += beta[o][k] * beta[o][k];
             }
             seen += a[count][k] * a[count][k];
-            if (g == 0) s.unknown = std::max(1 - seen[judged_member], 0.);
+            if (g == 0) found.unknown = std::max(1 - seen[judged_member], 0.);
             for (int j = k + 1; j < count; ++j) {
                 const V factor = a[j][k];
                 for (int i = j; i <= count; ++i) a[i][j] -= a[i][k] * factor;
@@ -164,8 +169,8 @@ static void local_processes(const Rules &r, Stream &s, const double *x, const do
             amplitude[o] /= double(count);
             const V variance = maximum(amplitude[o] * (1. + noise[g] - seen), amplitude[o] * noise[g]);
             for (int l = 0; l < lanes; ++l) {
-                s.means[o][g * lanes + l] = line[o] + mean[o][l];
-                s.variances[o][g * lanes + l] = variance[l];
+                found.means[o][g * lanes + l] = line[o] + mean[o][l];
+                found.variances[o][g * lanes + l] = variance[l];
             }
         }
     }
@@ -196,19 +201,19 @@ static int knot_of(const Rules &r, double mean, double &part) {
 static bool constant(const Stream &s, int o) { return !(s.wide[o] > 1e-15 * std::fabs(s.level[o])); }
 
 // Away from the samples the band goes over to the spread of y around its mean.
-static void let_go(const Rules &r, Stream &s, int o) {
+static void let_go(const Rules &r, const Stream &s, int o, Answer &a) {
     const double most = std::min(novel * s.usual_unknown, 1 - (1 - s.usual_unknown) / 4);
-    const double away = std::min(std::max((s.unknown - most) / std::max(1 - most, 1e-9), 0.), 1.);
+    const double away = std::min(std::max((a.unknown - most) / std::max(1 - most, 1e-9), 0.), 1.);
     const double middle = in_units(r, s, o, s.level[o]);
-    const double far = square(s.mean[o] - middle) + (constant(s, o) ? 1 : square(s.wide[o] / scale_of(r, s, n + o)));
-    const double near = s.variance[o] = std::max(s.variance[o], constant(s, o) ? still : 0);
-    s.variance[o] = near + away * (far - near);
-    s.weight[o] = near < far ? (1 - away) * near / s.variance[o] : 1;
+    const double far = square(a.mean[o] - middle) + (constant(s, o) ? 1 : square(s.wide[o] / scale_of(r, s, n + o)));
+    const double near = a.variance[o] = std::max(a.variance[o], constant(s, o) ? still : 0);
+    a.variance[o] = near + away * (far - near);
+    a.weight[o] = near < far ? (1 - away) * near / a.variance[o] : 1;
 }
 
 // The mixture of what the members say of an output, its correction, and its variance; within low and high.
-static void mix(const Rules &r, Stream &s, int o, double low, double high) {
-    const double *means = s.means[o], *variances = s.variances[o];
+static void mix(const Rules &r, const Stream &s, int o, double low, double high, Answer &a) {
+    const double *means = a.means[o], *variances = a.variances[o];
     double whole = 0, first = 0, second = 0, top = -infinity;
     for (int c = 0; c < clocks; ++c) top = std::max(top, s.clock_weights[o][c]);
     double doubts[members], claims[members], behind[members], surest = infinity;  // logarithms of variances
@@ -234,14 +239,14 @@ static void mix(const Rules &r, Stream &s, int o, double low, double high) {
         middle /= all_of;
         for (int i = 0; i < members; ++i)
             around += weights[i] * (variances[i] * s.excess[o][i] + square(means[i] - middle));
-        s.mixed[o][c] = middle, s.mixed_variance[o][c] = around / all_of;
+        a.mixed[o][c] = middle, a.mixed_variance[o][c] = around / all_of;
         const double weight = std::exp(s.clock_weights[o][c] - top);
         whole += weight, first += weight * middle;
     }
     first /= whole;
     for (int c = 0; c < clocks; ++c)
         second += std::exp(s.clock_weights[o][c] - top) / whole *
-                  (s.mixed_variance[o][c] + square(s.mixed[o][c] - first));
+                  (a.mixed_variance[o][c] + square(a.mixed[o][c] - first));
     for (int i = 0; i < members - 1; ++i) {
         const int g = group_of(i);
         const double weight = std::exp(s.weights[o][clocks - 1][i] - slow * doubts[i] - highest[g]);
@@ -250,8 +255,8 @@ static void mix(const Rules &r, Stream &s, int o, double low, double high) {
     const double unit = std::sqrt(std::max(s.pace[o], least)), most = r.correction_most;
     double stacked = 0;
     for (int g = 0; g < groups_of_members; ++g) {
-        s.away[o][g] = std::min(std::max((sum[g] / total[g] - first) / unit, -most), most);
-        stacked += s.correction[o][g] * s.away[o][g];
+        a.away[o][g] = std::min(std::max((sum[g] / total[g] - first) / unit, -most), most);
+        stacked += s.correction[o][g] * a.away[o][g];
     }
     stacked = std::max(std::min(first + unit * stacked, high), low);
     double logs[members], peak = -infinity, whole_of = 0, squared = 0;
@@ -260,7 +265,7 @@ static void mix(const Rules &r, Stream &s, int o, double low, double high) {
         const double weight = std::exp(logs[i] - peak);
         whole_of += weight, squared += weight * means[i];
     }
-    double *blend = s.blend[o];
+    double *blend = a.blend[o];
     blend[0] = first, blend[1] = stacked, blend[2] = squared / whole_of;
     auto mixed = [&](int count) {
         double best = -infinity, parts = 0, sum = 0;
@@ -271,15 +276,15 @@ static void mix(const Rules &r, Stream &s, int o, double low, double high) {
         }
         return sum / parts;
     };
-    s.straight[o] = mixed(blends - 1);
+    a.straight[o] = mixed(blends - 1);
     double part;
-    const int knot = knot_of(r, s.straight[o], part);
-    const double mapped = s.straight[o] + (1 - part) * s.map[o][0][knot] + part * s.map[o][0][knot + 1];
+    const int knot = knot_of(r, a.straight[o], part);
+    const double mapped = a.straight[o] + (1 - part) * s.map[o][0][knot] + part * s.map[o][0][knot + 1];
     blend[blends - 1] = std::max(std::min(mapped, high), low);
-    s.mean[o] = mixed(blends);
-    second += square(s.mean[o] - first);
-    s.variance[o] = std::max(second, r.floor * s.pace[o]) * s.calibration[o];
-    let_go(r, s, o);
+    a.mean[o] = mixed(blends);
+    second += square(a.mean[o] - first);
+    a.variance[o] = std::max(second, r.floor * s.pace[o]) * s.calibration[o];
+    let_go(r, s, o, a);
 }
 
 static double student(const Rules &r, double error, double variance) {
@@ -298,10 +303,10 @@ static void reweigh(double *logs, const double *scores, int count, double discou
 }
 
 // Least squares of the mixture's error on the groups' distance from it, both in running errors.
-static void learn_correction(const Rules &r, Stream &s, int o, double blended) {
+static void learn_correction(const Rules &r, Stream &s, const Answer &a, int o, double blended) {
     constexpr int G = groups_of_members;
     auto &covariance = s.correction_covariance[o];
-    const double most = r.correction_most, *away = s.away[o];
+    const double most = r.correction_most, *away = a.away[o];
     double error = blended / std::sqrt(std::max(s.pace[o], least)), gain[G], total = r.correction_forgetting, widest = 0;
     error = std::min(std::max(error, -most), most);
     for (int g = 0; g < G; ++g) {
@@ -320,12 +325,12 @@ static void learn_correction(const Rules &r, Stream &s, int o, double blended) {
 }
 
 // The map of the mean learns by least squares, each of two knots as if it stood alone.
-static void learn_map(const Rules &r, Stream &s, int o, double value) {
+static void learn_map(const Rules &r, Stream &s, const Answer &a, int o, double value) {
     double part;
-    const int knot = knot_of(r, s.straight[o], part);
+    const int knot = knot_of(r, a.straight[o], part);
     auto &correction = s.map[o][0], &known = s.map[o][1];
     const double of[] = {1 - part, part};
-    const double error = value - s.straight[o] - of[0] * correction[knot] - of[1] * correction[knot + 1];
+    const double error = value - a.straight[o] - of[0] * correction[knot] - of[1] * correction[knot + 1];
     for (int i = 0; i < 2; ++i) {
         double &k = known[knot + i];
         k = k * (1 - (1 - r.map_forgetting) * of[i]) + of[i] * of[i];
@@ -334,13 +339,13 @@ static void learn_map(const Rules &r, Stream &s, int o, double value) {
 }
 
 // The members and their mixtures are judged by their prediction of an output, in units.
-static void judge_members(const Rules &r, Stream &s, int o, double value) {
-    const double t = s.clock, error = value - s.mean[o], blended = value - s.blend[o][0];
-    learn_correction(r, s, o, blended);
-    learn_map(r, s, o, value);
-    const double z2 = error * error / std::max(s.variance[o], 1e-300), since = t - r.uncalibrated;
+static void judge_members(const Rules &r, Stream &s, const Answer &a, int o, double value) {
+    const double t = s.clock, error = value - a.mean[o], blended = value - a.blend[o][0];
+    learn_correction(r, s, a, o, blended);
+    learn_map(r, s, a, o, value);
+    const double z2 = error * error / std::max(a.variance[o], 1e-300), since = t - r.uncalibrated;
     const double row = std::pow(surprise, s.surprises[o]);  // each in a row may be so many times larger
-    const double surprised = std::min(std::max(s.weight[o] * (z2 - 1), -1.), surprise * row - 1) * s.calibration[o];
+    const double surprised = std::min(std::max(a.weight[o] * (z2 - 1), -1.), surprise * row - 1) * s.calibration[o];
     if (since > 0) s.calibration[o] += std::max(r.error_rate, 1 / (since + 5)) * surprised;
     s.calibration[o] = std::min(std::max(s.calibration[o], 1e-6), 1e2);
     auto follow = [&](double &running, double found, double rate, double most) {
@@ -348,19 +353,19 @@ static void judge_members(const Rules &r, Stream &s, int o, double value) {
     };
     double scores[members], over[clocks], of_blends[blends], least_square = infinity;
     for (int b = 0; b < blends; ++b) {
-        const double e = value - s.blend[o][b];
+        const double e = value - a.blend[o][b];
         of_blends[b] = student(r, e, std::max(s.own[o], least)), least_square = std::min(least_square, e * e);
     }
     reweigh(s.corrected[o], of_blends, blends, r.correction_discount, r.correction_share);
     for (int i = 0; i < members; ++i)
-        scores[i] = -r.squares_rate * std::min(square(value - s.means[o][i]) / std::max(s.best[o], least), 1e9);
+        scores[i] = -r.squares_rate * std::min(square(value - a.means[o][i]) / std::max(s.best[o], least), 1e9);
     reweigh(s.squares[o], scores, members, r.squares_discount, r.squares_share);
     follow(s.error[o], blended * blended, r.error_rate, surprise);
     follow(s.pace[o], blended * blended, r.pace, surprise);
     follow(s.own[o], error * error, r.own_rate, r.largest);
     follow(s.best[o], least_square, r.best_rate, r.largest);
     for (int i = 0; i < members; ++i) {
-        const double e = value - s.means[o][i], v = s.variances[o][i], ratio = e * e / std::max(v, least);
+        const double e = value - a.means[o][i], v = a.variances[o][i], ratio = e * e / std::max(v, least);
         double &excess = s.excess[o][i], &usual = s.usual[o][i];
         usual += std::max(r.members_rate, 1 / (t + 1)) * (std::log(std::max(v, least)) - usual);
         scores[i] = score(r, e, v * excess, s.error[o]);
@@ -373,7 +378,7 @@ static void judge_members(const Rules &r, Stream &s, int o, double value) {
     }
     s.surprises[o] = z2 > surprise ? std::min(s.surprises[o] + 1, 40.) : 0;
     for (int c = 0; c < clocks; ++c) {
-        over[c] = score(r, value - s.mixed[o][c], s.mixed_variance[o][c], s.error[o]);
+        over[c] = score(r, value - a.mixed[o][c], a.mixed_variance[o][c], s.error[o]);
         reweigh(s.weights[o][c], scores, members, r.discounts[c], r.share);
     }
     reweigh(s.clock_weights[o], over, clocks, r.discount, r.share);

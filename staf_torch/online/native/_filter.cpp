@@ -2,17 +2,21 @@
 
 #include "_filter.hpp"
 
-struct Call {
-    int64_t streams, stride, mode;  // 1 to predict, 2 to learn
-    REAL *table;                    // see StreamState: blocks of the rows of `lanes` streams
-    int64_t *counts;                // (4, stride)
-    const REAL *x, *y;              // (streams, n), (streams, K)
-    const double *lapse;            // (streams), or null for ones
+struct Streams {
+    int64_t streams, stride;
+    REAL *table;                       // see StreamState: blocks of the rows of `lanes` streams
+    int64_t *counts;                   // (4, stride)
     const double *ratio, *forgetting;  // (streams)
-    REAL *mean, *deviation;         // (streams, K)
     Functions functions;
     double slack2, robust, base, tiny, most;
 };
+struct Given {  // what belongs to a call alone: another thread may ask the same streams
+    int64_t mode;             // 1 to predict, 2 to learn
+    const REAL *x, *y;        // (streams, n), (streams, K)
+    const double *lapse;      // (streams), or null for ones
+    REAL *mean, *deviation;   // (streams, K)
+};
+struct Call : Streams, Given {};
 constexpr int tile = 64;  // streams that are worked on together stay in the cache
 constexpr int row_mean = 2 * n, row_learned = row_mean + (K + 1) * M, row_errors = row_learned + M * (M + 1) / 2;
 constexpr int rows_of_all = row_errors + 7 * K + 2, expectations = K + 2;
@@ -216,7 +220,8 @@ static void learn(const Call &call) {
     }
 }
 
-extern "C" void staf_filter(const Call *call) {
-    if (call->mode & 1) tell(*call);
-    if (call->mode & 2) learn(*call);
+extern "C" void staf_filter(const Streams *streams, const Given *given) {
+    const Call call{*streams, *given};
+    if (call.mode & 1) tell(call);
+    if (call.mode & 2) learn(call);
 }

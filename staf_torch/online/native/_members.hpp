@@ -21,6 +21,7 @@ struct Quadratics {
     Row coefficients[K][features];
 
     Row *column(int j) { return factor + j * (j + 1) / 2; }
+    const Row *column(int j) const { return factor + j * (j + 1) / 2; }
 
     void restart(V prior, Mask where) {
         for (int j = 0; j < features; ++j)
@@ -30,7 +31,7 @@ struct Quadratics {
     }
 
     // U' phi
-    void along(const double *phi, V *found) {
+    void along(const double *phi, V *found) const {
         for (int j = 0; j < features; ++j) {
             const Row *own = column(j);
             V sum = all(phi[j]);
@@ -40,7 +41,7 @@ struct Quadratics {
     }
 
     // The means, and the variance in units of the noise.
-    V predict(const double *phi, V *mean) {
+    V predict(const double *phi, V *mean) const {
         V f[features], spread = all(1);
         along(phi, f);
         for (int j = 0; j < features; ++j) spread += column(j)[j] * f[j] * f[j];
