@@ -57,7 +57,6 @@ def compiled(source: Path, *definitions: str) -> Callable[..., None] | None:
             library = ctypes.CDLL(str(_library(name, text, options, source.parent)))
         call: Callable[..., None] = library[f"staf_{name}"]
         call.restype = None  # type: ignore[attr-defined]
-        call.argtypes = (ctypes.c_void_p, ctypes.c_void_p)  # type: ignore[attr-defined]
     except Exception as error:  # whatever a machine lacks, the reference computes the same
         _say(name, " ".join(str(error).split())[:300])
         return None

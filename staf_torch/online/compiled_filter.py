@@ -7,6 +7,7 @@ import math
 import struct
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,10 +15,12 @@ from torch import Tensor
 from ..lanes.compiler import compiled
 from .kalman_filter import LocalFilter, StreamState
 from .local_functions import LocalFunctions
+from .samples import in_place
 
 NATIVE = Path(__file__).with_name("native")
 """The folder of the C++ of this room."""
 
+_SHORT = 10_000  # streams times the square of centers: a call of some 20 us at most
 _REALS = {torch.float32: "float", torch.float64: "double"}
 _MOST = 66  # centers: beyond, unrolled loops and a stack frame of M^2 vectors no longer pay
 
@@ -58,13 +61,14 @@ class StreamsInC(ctypes.Structure):
     _fields_ = (
         ("streams", ctypes.c_int64),
         ("stride", ctypes.c_int64),
+        ("closed", ctypes.c_int64),
         *((name, ctypes.c_void_p) for name in ("table", "counts", "ratio", "forgetting")),
         ("functions", FunctionPointers),
         *((name, ctypes.c_double) for name in ("slack2", "robust", "base", "tiny", "most")),
     )
 
 
-_packed = struct.Struct("6q").pack  # `Given` of _filter.cpp: what belongs to a call alone
+_packed = struct.Struct("7q").pack  # `Given` of _filter.cpp: what belongs to a call alone
 
 
 class CompiledFilter:
@@ -84,9 +88,13 @@ class CompiledFilter:
         numbers = torch.finfo(state.dtype)
         places = [each.data_ptr() for each in (state.blocks, state.counts, ratio, forgetting)]
         law = definition.slack**2, definition.robust, definition.base, numbers.eps**0.5, numbers.max
-        self._streams = StreamsInC(streams, streams, *places, pointers, *law)
-        self._run, self._reference = call, ctypes.addressof(self._streams)
+        self._streams = StreamsInC(streams, streams, 0, *places, pointers, *law)
+        self._run, self.reference = call, ctypes.addressof(self._streams)
+        # the same function, called without giving Python's lock away
+        address = ctypes.cast(call, ctypes.c_void_p).value  # type: ignore[arg-type]
+        self.holding = ctypes.PYFUNCTYPE(ctypes.c_int, ctypes.c_char_p)(address)
         self._shape = (streams, state.outputs)
+        self.short = streams * state.count**2 <= _SHORT
 
     @classmethod
     def build(cls, definition: LocalFilter, state: StreamState) -> CompiledFilter | LocalFilter:
@@ -99,13 +107,64 @@ class CompiledFilter:
         call = compiled(NATIVE / "_filter.cpp", *sizes, f"REAL={real}")
         return definition if call is None else cls(definition, state, call)
 
+    def close(self, closed: bool) -> None:
+        """Let direct calls do nothing while the streams are changed, or go on with them."""
+        self._streams.closed = closed
+
     def predict(self, state: StreamState, x: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of the next y at x (S, n), contiguous, of the table's dtype: (S, K)."""
         mean, deviation = x.new_empty(self._shape), x.new_empty(self._shape)
-        self._run(self._reference, _packed(1, x.data_ptr(), 0, 0, mean.data_ptr(), deviation.data_ptr()))
+        places = x.data_ptr(), 0, 0, mean.data_ptr(), deviation.data_ptr()
+        self._run(_packed(self.reference, 1, *places))
         return mean, deviation
 
     def learn(self, state: StreamState, x: Tensor, y: Tensor, lapse: Tensor | None = None) -> None:
         """Learn one sample a stream: (S, n), (S, K), contiguous and in the table's dtype; (S,) float64."""
         time = 0 if lapse is None else lapse.data_ptr()
-        self._run(self._reference, _packed(2, x.data_ptr(), y.data_ptr(), time, 0, 0))
+        self._run(_packed(self.reference, 2, x.data_ptr(), y.data_ptr(), time, 0, 0))
+
+
+class DirectCalls:
+    """Calls of a compiled filter on a few streams that need no lock: they hold Python's own.
+
+    What a call must fit and where the streams lie is one object, so that both are always of the same streams.
+
+    Args:
+        filter_: the compiled filter, whose calls are `short`.
+        dtype: of samples that are read where they lie.
+        shape: of their x.
+        targets: of their y.
+    """
+
+    def __init__(
+        self, filter_: CompiledFilter, dtype: torch.dtype, shape: tuple[int, ...], targets: tuple[int, ...]
+    ) -> None:
+        self.filter, self._dtype, self._shape, self._targets = filter_, dtype, shape, targets
+        self._run, self._reference = filter_.holding, filter_.reference
+
+    def close(self) -> None:
+        """Do nothing from now on."""
+        self.filter.close(True)
+
+    def open(self, streams: Any) -> bool:
+        """Go on, unless the streams have got another filter since: return whether."""
+        same = getattr(streams, "_filter", None) is self.filter
+        if same:
+            self.filter.close(False)
+        return same
+
+    def learn(self, x: Any, y: Any) -> bool:
+        """Learn one sample a stream; False where it does not fit, or the streams are just changed."""
+        return (
+            in_place(x, self._dtype, self._shape)
+            and in_place(y, self._dtype, self._targets)
+            and self._run(_packed(self._reference, 6, x.data_ptr(), y.data_ptr(), 0, 0, 0)) == 1
+        )
+
+    def predict(self, x: Any) -> tuple[Tensor, Tensor] | None:
+        """Mean and standard deviation of the next y; None where `learn` returns False."""
+        if not in_place(x, self._dtype, self._shape):
+            return None
+        mean, deviation = x.new_empty(self._targets), x.new_empty(self._targets)
+        places = x.data_ptr(), 0, 0, mean.data_ptr(), deviation.data_ptr()
+        return (mean, deviation) if self._run(_packed(self._reference, 5, *places)) == 1 else None

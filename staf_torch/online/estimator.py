@@ -8,6 +8,7 @@ import math
 import numbers
 import sys
 import warnings
+from collections.abc import Callable
 from typing import Any, Protocol, Self
 
 import numpy as np
@@ -17,7 +18,8 @@ from torch import Tensor
 from ..kernels import NAMED, Kernel
 from ..lanes.locks import ReadWriteLock
 from ..numerics.checks import choice, fail, integer
-from .samples import lapse_of, lapses, like_given, pair, tensor_of
+from .compiled_filter import DirectCalls
+from .samples import in_place, lapse_of, lapses, like_given, pair, tensor_of
 
 
 class ScikitEstimator:
@@ -143,8 +145,11 @@ class Streams(Protocol):
     def learned(self) -> Tensor: ...  # samples, (S,) int64
     @property
     def skipped(self) -> Tensor: ...
-    def predict(self, x: Tensor) -> tuple[Tensor, Tensor]: ...  # of the next y at x (S, n): mean, deviation
+    def predict(  # mean and deviation of the next y at x (S, n), in a shape
+        self, x: Tensor, shape: tuple[int, ...] | None = None
+    ) -> tuple[Tensor, Tensor]: ...
     def learn(self, x: Tensor, y: Tensor, lapse: Tensor | None = None) -> None: ...
+    def direct(self, shape: tuple[int, ...], targets: tuple[int, ...]) -> DirectCalls | None: ...
     def clear(self, rows: Tensor) -> None: ...  # these streams begin anew
     def add(self, streams: int) -> None: ...  # behind the others
     def keep(self, rows: Tensor) -> None: ...  # these alone
@@ -171,9 +176,11 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
     n_streams_: int | None
     n_outputs_: int | None
     _streams_: Streams
-    _shape_: tuple[int, ...]  # of a sample's x
-    _targets_: tuple[int, ...]  # of its y
+    _shape_: tuple[int, ...] = ()  # of a sample's x
+    _targets_: tuple[int, ...] = ()  # of its y
     _dtype_: torch.dtype
+    _in_place_: torch.dtype | None = None  # of samples that compiled code reads where they are
+    _direct_: DirectCalls | None = None  # calls that need no lock
 
     def __init__(self) -> None:
         self._lock = ReadWriteLock()
@@ -201,7 +208,7 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         lapse, twin = lapses(self._call("fit"), time, states), self._twin()
         for k, (state, value) in enumerate(zip(states, values, strict=True)):
             twin._learn(state, value, None if lapse is None else lapse[k])
-        self._lock.write(self._take_over, twin)
+        self._change(self._take_over, twin)
         return self
 
     def _twin(self) -> Self:
@@ -229,11 +236,17 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
             ValueError: if a shape is another one than at the first sample, or, at the first sample, an
                 argument of the constructor breaks its rule.
         """
-        self._lock.write(self._partial_fit, x, y, lapse)
+        direct = self._direct_
+        if direct is None or lapse is not None or not direct.learn(x, y):
+            self._change(self._partial_fit, x, y, lapse)
         return self
 
     def _partial_fit(self, x: Any, y: Any, lapse: Any) -> None:
-        if lapse is None and self._is_plain(x) and self._is_plain(y, target=True):
+        if (
+            lapse is None
+            and in_place(x, self._in_place_, self._shape_)
+            and in_place(y, self._in_place_, self._targets_)
+        ):
             self._streams_.learn(x, y)  # what compiled code reads as it is: nothing to convert or check
             return
         call = self._call("partial_fit")
@@ -267,13 +280,29 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         Raises:
             ValueError: before the first sample, or for another number of streams or dimensions.
         """
+        if (direct := self._direct_) is not None and (found := direct.predict(x)) is not None:
+            return found if return_std else found[0]
         return self._lock.read(self._predict, x, return_std)
 
+    def _change(self, function: Callable[..., object], *given: Any) -> None:
+        """Call what changes the streams while nobody else has to do with them."""
+        self._lock.write(self._changed, function, *given)
+
+    def _changed(self, function: Callable[..., object], *given: Any) -> None:
+        direct, streams = self._direct_, self.__dict__.get("_streams_")
+        if direct is not None:
+            direct.close()
+        try:
+            function(*given)
+        finally:
+            now = self.__dict__.get("_streams_")
+            if direct is None or now is not streams or not direct.open(now):
+                self._direct_ = None if now is None else now.direct(self._shape_, self._targets_)
+
     def _predict(self, x: Any, return_std: bool) -> Any:
-        if self._is_plain(x):
-            mean, deviation = self._streams_.predict(x)
-            mean = mean.view(self._targets_)
-            return (mean, deviation.view(self._targets_)) if return_std else mean
+        if in_place(x, self._in_place_, self._shape_):
+            mean, deviation = self._streams_.predict(x, self._targets_)
+            return (mean, deviation) if return_std else mean
         points = tensor_of(self._call("predict"), "x", x)
         own = 1 if self._fitted("predict").n_streams_ is None else 2
         several = points.dim() == own + 1
@@ -290,18 +319,6 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
 
         return (joined(0), joined(1)) if return_std else joined(0)
 
-    def _is_plain(self, value: Any, target: bool = False) -> bool:
-        """Return whether compiled code can read a sample in place."""
-        return (
-            type(value) is Tensor
-            and "_streams_" in self.__dict__
-            and self._streams_.compiled
-            and value.dtype is self._streams_.dtype
-            and value.shape == (self._targets_ if target else self._shape_)
-            and not value.requires_grad
-            and value.is_contiguous()
-        )
-
     def _prepare(self, x: Tensor, y: Tensor) -> None:
         """Infer the sizes from the first sample, check the arguments and begin the streams."""
         dtype = x.dtype if x.dtype in (torch.float32, torch.float64) else torch.float64
@@ -309,6 +326,7 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         outputs = y.shape[-1] if y.dim() == x.dim() else 1
         self._streams_ = self._begin(count, outputs, torch.zeros(x.shape[-1], dtype=dtype, device=x.device))
         self._shape_, self._targets_, self._dtype_ = tuple(x.shape), tuple(y.shape), dtype
+        self._in_place_ = dtype if self._streams_.compiled else None
         self.n_features_in_ = x.shape[-1]
         self.n_streams_ = None if x.dim() == 1 else count
         self.n_outputs_ = outputs if y.dim() == x.dim() else None
@@ -326,7 +344,7 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
 
     def reset(self, streams: Any = None) -> Self:
         """Forget everything, dimension and streams included; or what these streams learned."""
-        self._lock.write(self._reset, streams)
+        self._change(self._reset, streams)
         return self
 
     def _reset(self, streams: Any = None) -> None:
@@ -338,7 +356,7 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
 
     def add(self, streams: int = 1) -> Self:
         """Begin further streams, numbered behind the others."""
-        self._lock.write(self._add, streams)
+        self._change(self._add, streams)
         return self
 
     def _add(self, streams: int) -> None:
@@ -350,7 +368,7 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
 
     def drop(self, streams: Any) -> Self:
         """Give up the streams with these numbers; the others close ranks."""
-        self._lock.write(self._drop, streams)
+        self._change(self._drop, streams)
         return self
 
     def _drop(self, streams: Any) -> None:
@@ -438,7 +456,7 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         x = torch.zeros(*leading, state["n_features_in_"], dtype=dtype)
         twin._prepare(x, x.new_zeros((*leading, *(() if outputs is None else (outputs,)))))
         twin._streams_.load_state_dict(state)
-        self._lock.write(self._take_over, twin, state)
+        self._change(self._take_over, twin, state)
         return self
 
     def __getstate__(self) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .compiled_filter import CompiledFilter
+from .compiled_filter import CompiledFilter, DirectCalls
 from .kalman_filter import STREAK, LocalFilter, StreamState
 
 LEARNED_AT = (2, 5, 10, 20, 40)  # samples after which the units are learned
@@ -73,6 +73,12 @@ class FilterStreams:
         self._center, self._spread = self.units.to(self.dtype).split(state.dim + state.outputs, dim=1)
         self._calm, self._even = False, 0  # until `_see`
 
+    def direct(self, shape: tuple[int, ...], targets: tuple[int, ...]) -> DirectCalls | None:
+        """Return the calls that need no lock, of samples of these shapes; None where there are none."""
+        if self.scaling or not isinstance(self._filter, CompiledFilter) or not self._filter.short:
+            return None
+        return DirectCalls(self._filter, self.dtype, shape, targets)
+
     @property
     def count(self) -> int:
         """Return S."""
@@ -88,10 +94,11 @@ class FilterStreams:
         """Samples skipped, (S,) int64."""
         return self.state.counts[1]
 
-    def predict(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation of the next y at x (S, n): (S, K), (S, K)."""
+    def predict(self, x: Tensor, shape: tuple[int, ...] | None = None) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation of the next y at x (S, n): (S, K), or in ``shape``."""
         if not self.scaling:
-            return self._filter.predict(self.state, x)
+            mean, deviation = self._filter.predict(self.state, x)
+            return (mean, deviation) if shape is None else (mean.view(shape), deviation.view(shape))
         n = self.state.dim
         mean, deviation = self._filter.predict(self.state, (x - self._center[:, :n]) / self._spread[:, :n])
         return mean * self._spread[:, n:] + self._center[:, n:], deviation * self._spread[:, n:]

@@ -138,7 +138,7 @@ class StaFRegressor(StreamEstimator):
         states = turned_in_time(states, self._angles(states.shape[-1]))
         targets = values if values.dim() == states.dim() else values.unsqueeze(-1)
         rows = [part.unsqueeze(1) if states.dim() == 2 else part for part in (states, targets)]
-        self._lock.write(self._hold, tuning(rows[0], rows[1], self._directions(states.shape[-1])))
+        self._change(self._hold, tuning(rows[0], rows[1], self._directions(states.shape[-1])))
         return self
 
     def _hold(self, found: Tuning) -> None:

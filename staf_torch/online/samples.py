@@ -33,6 +33,19 @@ def tensor_of(call: str, name: str, value: Any) -> Tensor:
     return found if found.is_floating_point() else found.double()
 
 
+def in_place(value: Any, dtype: torch.dtype | None, shape: tuple[int, ...]) -> bool:
+    """Return whether compiled code can read a sample where it lies, as one of this dtype and shape."""
+    return (
+        type(value) is Tensor
+        and value.dtype is dtype
+        and value.shape == shape
+        and value.is_cpu
+        and not value.requires_grad
+        and value.is_contiguous()
+        and not value.is_neg()
+    )
+
+
 def pair(call: str, x: Any, y: Any, dims: tuple[int, int]) -> tuple[Tensor, Tensor]:
     if y is None:
         raise ValueError(f"`{call}` requires y to be passed, but the target y is None.")

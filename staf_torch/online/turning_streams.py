@@ -31,6 +31,9 @@ class TurningStreams:
     def compiled(self) -> bool:
         return self.inner.compiled
 
+    def direct(self, shape: tuple[int, ...], targets: tuple[int, ...]) -> None:
+        """No calls without a lock: samples are turned before."""
+
     @property
     def count(self) -> int:
         return self.inner.count
@@ -48,8 +51,8 @@ class TurningStreams:
         latest = self.latest.reshape(x.shape)
         return torch.where(latest.isnan() | x.isnan(), x, turned(x, latest, self.periodic))
 
-    def predict(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        return self.inner.predict(self.near(x))
+    def predict(self, x: Tensor, shape: tuple[int, ...] | None = None) -> tuple[Tensor, Tensor]:
+        return self.inner.predict(self.near(x), shape)
 
     def learn(self, x: Tensor, y: Tensor, lapse: Tensor | None = None) -> None:
         at = self.near(x)

@@ -11,6 +11,7 @@ struct Streams {
     const Rules *rules;
 };
 struct Call {  // what belongs to a call alone: another thread may ask the same streams
+    const Streams *streams;
     int64_t mode;                 // 1 to predict, 2 to learn
     const double *x, *y, *lapse;  // (count, n), (count, K), (count)
     double *mean, *deviation;     // (count, K)
@@ -422,10 +423,10 @@ static void tell(const Rules &r, const Stream &s, Answer &a, const double *given
     }
 }
 
-extern "C" void staf_bank(const Streams *streams, const Call *call) {
-    const Rules &r = *streams->rules;
-    for (int64_t i = 0; i < streams->count; ++i) {
-        Stream &s = reinterpret_cast<Stream *>(streams->table)[i];
+extern "C" void staf_bank(const Call *call) {
+    const Rules &r = *call->streams->rules;
+    for (int64_t i = 0; i < call->streams->count; ++i) {
+        Stream &s = reinterpret_cast<Stream *>(call->streams->table)[i];
         Answer &a = reinterpret_cast<Answer *>(call->answers)[i];
         if (call->mode & 1) tell(r, s, a, call->x + i * n, call->mean + i * K, call->deviation + i * K);
         if (call->mode & 2) learn(r, s, a, call->x + i * n, call->y + i * K, call->lapse ? call->lapse[i] : 1);

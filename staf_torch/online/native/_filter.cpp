@@ -3,7 +3,7 @@
 #include "_filter.hpp"
 
 struct Streams {
-    int64_t streams, stride;
+    int64_t streams, stride, closed;  // closed: their owner changes them, and direct calls do nothing
     REAL *table;                       // see StreamState: blocks of the rows of `lanes` streams
     int64_t *counts;                   // (4, stride)
     const double *ratio, *forgetting;  // (streams)
@@ -11,7 +11,8 @@ struct Streams {
     double slack2, robust, base, tiny, most;
 };
 struct Given {  // what belongs to a call alone: another thread may ask the same streams
-    int64_t mode;             // 1 to predict, 2 to learn
+    const Streams *of;
+    int64_t mode;             // 1 to predict, 2 to learn; 4 for a direct call
     const REAL *x, *y;        // (streams, n), (streams, K)
     const double *lapse;      // (streams), or null for ones
     REAL *mean, *deviation;   // (streams, K)
@@ -220,8 +221,10 @@ static void learn(const Call &call) {
     }
 }
 
-extern "C" void staf_filter(const Streams *streams, const Given *given) {
-    const Call call{*streams, *given};
+extern "C" int staf_filter(const Given *given) {
+    const Call call{*given->of, *given};
+    if (call.closed && call.mode & 4) return 0;
     if (call.mode & 1) tell(call);
     if (call.mode & 2) learn(call);
+    return 1;
 }
