@@ -154,7 +154,7 @@ VARIANTS = {
 CALLS: dict[str, Callable[..., Any]] = {
     **{each.__name__: each for each in PLAIN},
     "ActorCritic": of(adp.ActorCritic, adp.QuadraticBasis(2), PLANT, COST, adp.RandomPoints(1, 1.0)),
-    "StaFValueBasis": of(adp.StaFValueBasis, BASIS),
+    "StaFValueBasis": of(adp.StaFValueBasis, st.StaFBasis(st.ExponentialKernel(), BASIS.centers)),
     "RBFGridBasis": of(adp.RBFGridBasis, dim=2, points=2),
     "LeadingCoordinates": of(LeadingCoordinates, GRID),
     "ClosedLoop": of(ClosedLoop, adp.Feedback(LQR), PLANT, COST, dt=0.01),

@@ -79,6 +79,7 @@ class StaFBasis(nn.Module):
     Source: Rosenfeld et al., section 2.
     """
 
+    _unseen = True  # until the first evaluation at the own state, where a constant one is reported
     _choose_again = False  # whether directions came without what fixes their local basis
     convention: Tensor
 
@@ -113,8 +114,13 @@ class StaFBasis(nn.Module):
         return self.centers.dim
 
     def forward(self, y: Tensor, x: Tensor) -> Tensor:
-        """sigma(y; x): (..., P, n), (..., n) -> (..., P, M)."""
+        """sigma(y; x): (..., P, n), (..., n) -> (..., P, M).
+
+        The first evaluation at y = x warns where sigma(x; x) is the same at every state: `check_own_value`.
+        """
         trailing("StaFBasis", "y", y, dims=2, last=self.dim)
+        if self._unseen and not torch.compiler.is_compiling() and _same(y, x):
+            self.check_own_value(x, stacklevel=5)
         sigma: Tensor = self.kernel(y, self.centers(x))
         return sigma
 
@@ -133,6 +139,11 @@ class StaFBasis(nn.Module):
     def local(self, x: Tensor) -> LocalSpace:
         """The span of the basis at the states x (..., n), in a basis that can be computed with."""
         trailing("StaFBasis.local", "x", x, dims=1, last=self.dim)
+        if x.dtype in (torch.float16, torch.bfloat16):
+            raise ValueError(
+                "`StaFBasis.local(x=...)` must be of float32 or float64, in which a Gram matrix can be "
+                f"factored (`x.float()`; `StaF` does it by itself); got {x.dtype}."
+            )
         return self._local_basis.space(self.kernel, self.centers, x)
 
     def check_reach(self, x: Tensor, stacklevel: int = 3) -> bool:
@@ -160,10 +171,68 @@ class StaFBasis(nn.Module):
             )
         return worst > 1
 
+    def check_own_value(self, x: Tensor, stacklevel: int = 2) -> bool:
+        """Warn, and say so, where sigma(x; x) is the same at every state: w'sigma(x; x) is then a constant.
+
+        It is so for a kernel of y - c alone and offsets c - y that do not depend on the state, whatever they
+        are called; found by evaluation at the states x (..., n), at four around each and at the origin.
+        """
+        self._unseen = False
+        change = torch.inf if x.is_meta else self._own_change(x)
+        if change > 1e-7:
+            return False
+        kernel = type(self.kernel).__name__
+        moving = "centers at a `StateRadius`, " if bool((self.centers.directions != 0).any()) else ""
+        warnings.warn(
+            f"StaFBasis of {kernel} has the same values at every state that it stands around (largest "
+            f"relative change of basis(x, x) between states: {change:.2g}): V^(x) = basis(x, x) @ w is a "
+            f"constant, whatever w is. Take `AnchoredKernel({kernel}(...))`, `ExponentialKernel()`, "
+            f"{moving}or weights that depend on x.",
+            stacklevel=stacklevel,
+        )
+        return True
+
+    @torch.no_grad()
+    def check_learned(self) -> None:
+        """Refuse learned hyperparameters that have left their rules, before a compiled program reads them.
+
+        Raises:
+            ValueError: by `numerics.checks.kept`, where kernel, radius or centers read one.
+        """
+        if any(True for _ in self.parameters()):
+            zero = self.centers.directions.new_zeros(1, self.dim)
+            self(zero.unsqueeze(-2) + 1, zero)
+
+    @torch.no_grad()
+    def _own_change(self, x: Tensor) -> float:
+        """The largest change of sigma(x; x) between states, of its largest entry; inf where not finite."""
+        at = torch.where(torch.isfinite(x), x, 0.0).double()
+        axis = torch.arange(1, self.dim + 1, dtype=at.dtype, device=at.device)
+        size = 1 + at.norm(dim=-1, keepdim=True)
+        around = [at + s * size * (s * axis).cos() for s in (0.1, 0.5, 1.0, 3.0)]
+        found = torch.stack(
+            [self.kernel(p.unsqueeze(-2), self.centers(p)) for p in (at, torch.zeros_like(at), *around)]
+        )
+        change = (found - found[:1]).abs().amax() / found.abs().amax().clamp(min=torch.finfo(at.dtype).tiny)
+        return float(torch.where(torch.isfinite(change), change, torch.inf))
+
     def values(self, x: Tensor, target: Target, outputs: int | None = None) -> Tensor:
-        """V(c(x)): (..., n) -> (..., M); of a target with k outputs (k, ..., M)."""
+        """V(c(x)): (..., n) -> (..., M); of a target with k outputs (k, ..., M).
+
+        Raises:
+            ValueError: if the target returns another shape, or is a network of another precision.
+        """
         centers = self.centers(x)
-        values = sampled(target, target(centers), centers, outputs)
+        try:
+            found = target(centers)
+        except RuntimeError as error:
+            if "dtype" not in str(error):
+                raise
+            raise ValueError(
+                f"The target must take points of {centers.dtype}, in which this basis computes: convert one "
+                f"of them by `.double()` or `.float()`; torch says: {error}"
+            ) from error
+        values = sampled(target, found, centers, outputs)
         return values if outputs is None else values.movedim(-1, 0)
 
     def ideal_weights(self, x: Tensor, target: Target) -> Tensor:
@@ -233,3 +302,12 @@ class StaFBasis(nn.Module):
         super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
         self._prepare()  # in the new dtype, on the new device
         return self
+
+
+def _same(y: Tensor, x: Tensor) -> bool:
+    """Return whether the points y (..., P, n) are the states x themselves, in plain tensors with values."""
+    if y.shape not in (x.shape, x.unsqueeze(-2).shape) or y.numel() == 0 or y.is_meta:
+        return False
+    if torch._C._functorch.peek_interpreter_stack() is not None or torch._C._len_torch_dispatch_stack():
+        return False
+    return y.data_ptr() == x.data_ptr() or (y.is_cpu and torch.equal(y.reshape(x.shape), x))

@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn.utils import parametrize
 
 from ..centers import StateFollowingCenters
 from ..kernels import Kernel
@@ -41,15 +42,21 @@ def record(
 
 
 def described(module: nn.Module) -> str:
-    """Return class and settings that are not tensors, children included: what a state_dict does not hold."""
+    """Return class and settings that are not tensors, children included: what a state_dict does not hold.
+
+    How a learned number is parametrised (`torch.nn.utils.parametrize`) is no part of the function.
+    """
     plain = {
         name: value
         for name, value in vars(module).items()
         if not name.startswith("_") and name != "training" and isinstance(value, bool | int | float | str)
     }
     parts = [f"{name}={value!r}" for name, value in sorted(plain.items())]
-    parts += [f"{name}={described(child)}" for name, child in sorted(module.named_children())]
-    return f"{type(module).__name__}({', '.join(parts)})"
+    children = [
+        (name, child) for name, child in sorted(module.named_children()) if name != "parametrizations"
+    ]
+    parts += [f"{name}={described(child)}" for name, child in children]
+    return f"{parametrize.type_before_parametrizations(module).__name__}({', '.join(parts)})"
 
 
 def encode(record: dict[str, Any]) -> Tensor:

@@ -14,6 +14,7 @@ from ..numerics.linalg import row_jacobian
 from .basis import StaFBasis, Target
 
 _MODES = ("partial", "total_frozen_weights", "total")
+_STARTS = ("random", "zeros")
 
 
 class StaF(nn.Module):
@@ -22,7 +23,8 @@ class StaF(nn.Module):
     The coefficients are held in the local basis at x, where they stay finite while the paper's weights w
     overflow; `weights` derives w from them. They are a parameter, or a buffer where they are not to be
     learned; the state is a buffer. Hyperparameters of the basis are learned where it was given them as
-    `nn.Parameter`. `forward` changes nothing in the module.
+    `nn.Parameter`. `forward` changes nothing in the module. It computes in the module's precision, in float32
+    where that is a half type, and returns that of its points: behind float32 layers it needs no `.float()`.
 
     Example:
         >>> basis = StaFBasis(ExponentialKernel(), StateFollowingCenters(rings(6), radius=0.1))
@@ -39,6 +41,10 @@ class StaF(nn.Module):
         out_features: k, several functions over the same centers: targets then map (..., n) to (..., k), and
             values are (..., P, k), coefficients and weights (..., k, M). None: one function, without that
             dimension.
+        init: where the coefficients begin, at the state 0. ``random``: V^ is near a random linear function of
+            the size with which `nn.Linear` begins (without its constant where k(0, 0) = 0), so that gradients
+            reach what is before and behind the layer from the first step. ``zeros``: V^ = 0. By default
+            ``random`` where the coefficients are learnable; `fit_` replaces either.
         learnable: whether the coefficients are a parameter.
         dtype: of the coefficients and the state; by default that of the directions.
         device: likewise.
@@ -53,6 +59,7 @@ class StaF(nn.Module):
         batch_shape: tuple[int, ...] = (),
         out_features: int | None = None,
         *,
+        init: str | None = None,
         learnable: bool = True,
         dtype: torch.dtype | None = None,
         device: torch.device | str | None = None,
@@ -70,16 +77,34 @@ class StaF(nn.Module):
         self.coefficients = hold(
             self, "coefficients", nn.Parameter(zero) if flag("StaF", "learnable", learnable) else zero
         )
+        self.init = _STARTS[0 if learnable else 1] if init is None else choice("StaF", "init", init, _STARTS)
         self.state = hold(self, "state", like.new_zeros(*self.batch_shape, basis.dim))
         self._target: Target | None
-        self._remember(None)
+        self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Back to V^ = 0 at the state 0."""
+        """Back to the state 0 and to coefficients as `init` says, drawn anew."""
         with torch.no_grad():
-            self.coefficients.zero_()
             self.state.zero_()
+            if self.init == "zeros" or self.coefficients.is_meta:
+                self.coefficients.zero_()
+            else:
+                self.coefficients.copy_(self._random())
         self._remember(None)
+
+    def _random(self) -> Tensor:
+        """The coefficients of random linear functions around the state 0: (..., M), or (..., k, M)."""
+        x, n = self.state.double(), self.basis.dim
+        outputs = self.out_features or 1
+        drawn = (
+            2 * torch.rand(*self.batch_shape, outputs, n + 1, dtype=x.dtype, device=x.device) - 1
+        ) / n**0.5
+        corner = self.basis.kernel(x.new_zeros(1, n), x.new_zeros(1, n))
+        drawn[..., n] *= bool(
+            (corner > 0).all()
+        )  # where k(0, 0) = 0 every function of the space vanishes at 0
+        values = drawn[..., :n] @ self.basis.centers.offsets(x).mT + drawn[..., n:]
+        return self.basis.local(x).fit(values.movedim(-2, 0)).movedim(0, -2).view_as(self.coefficients)
 
     @property
     def weights(self) -> Tensor:
@@ -117,7 +142,7 @@ class StaF(nn.Module):
                 f"`StaF.fit_(x=...)` must have the shape {tuple(self.state.shape)}; got {tuple(x.shape)}."
             )
         with torch.no_grad():
-            x = x.to(self.state)
+            x = _wide(x.to(self.state))
             self.basis.check_reach(x)
             coefficients = self.basis.local(x).fit(self.basis.values(x, target, self.out_features))
             self.state.copy_(x)
@@ -134,7 +159,8 @@ class StaF(nn.Module):
             ValueError: if y has the shape (*batch_shape, n), which could mean either.
         """
         self._points("StaF", y, "`StaF.rowwise(y)`")
-        return self.at_offsets(y - self.state.unsqueeze(-2))
+        x = _wide(self.state)
+        return self.at_offsets(y.to(x.dtype) - x.unsqueeze(-2)).to(y.dtype)
 
     def rowwise(self, y: Tensor) -> Tensor:
         """V^ of each batch entry at its own point: (*batch_shape, n) -> batch_shape, or (*batch_shape, k).
@@ -157,16 +183,17 @@ class StaF(nn.Module):
                 f"`StaF.rowwise(y=...)` must have a shape that ends with {tuple(self.state.shape)}; got "
                 f"{tuple(y.shape)}. For P points of every batch entry: `StaF(y)` with y (..., P, n)."
             )
-        offsets = (y - self.state).unsqueeze(-2)
-        return self.at_offsets(offsets).squeeze(-1 if self.out_features is None else -2)
+        x = _wide(self.state)
+        offsets = (y.to(x.dtype) - x).unsqueeze(-2)
+        return self.at_offsets(offsets).squeeze(-1 if self.out_features is None else -2).to(y.dtype)
 
     def at_offsets(self, z: Tensor) -> Tensor:
         """V^(x + z; x): (..., P, n) -> (..., P), or (..., P, k).
 
         For radii near the rounding of x, where y - x has no digits left.
         """
-        coefficients = self._outputs_first(z.dim() - 2)
-        return self._outputs_last(self.basis.local(self.state).evaluate(z, coefficients))
+        x, coefficients = _wide(self.state), self._outputs_first(z.dim() - 2)
+        return self._outputs_last(self.basis.local(x).evaluate(z.to(x.dtype), coefficients)).to(z.dtype)
 
     def value_and_gradient(
         self, y: Tensor, mode: str = "partial", target: Target | None = None
@@ -186,12 +213,15 @@ class StaF(nn.Module):
         """
         choice("StaF.gradient", "mode", mode, _MODES)
         self._points("StaF.gradient", y, "`StaF.gradient(y.unsqueeze(-2)).squeeze(-2)`")
-        z = y - self.state.unsqueeze(-2)
+        x = _wide(self.state)
+        given, y = y.dtype, y.to(x.dtype)
+        z = y - x.unsqueeze(-2)
         if mode != "partial":
-            return self(y), row_jacobian(self._along(y, z, mode, target), torch.zeros_like(z))[1]
-        space, coefficients = self.basis.local(self.state), self._outputs_first(z.dim() - 2)
+            slope = row_jacobian(self._along(y, z, mode, target), torch.zeros_like(z))[1]
+            return self(y).to(given), slope.to(given)
         values: Tensor
-        values, gradient = space.evaluate_with_gradient(z, coefficients)
+        values, gradient = self.basis.local(x).evaluate_with_gradient(z, self._outputs_first(z.dim() - 2))
+        values, gradient = values.to(given), gradient.to(given)
         if self.out_features is None:
             return values, gradient
         return values.movedim(0, -1), gradient.movedim(0, -2)
@@ -218,12 +248,14 @@ class StaF(nn.Module):
         """
         choice("StaF.hessian", "mode", mode, _MODES)
         trailing("StaF.hessian", "y", y, dims=2, last=self.basis.dim)
-        z = y - self.state.unsqueeze(-2)
+        x = _wide(self.state)
+        given, y = y.dtype, y.to(x.dtype)
+        z = y - x.unsqueeze(-2)
         start = torch.zeros_like(z)
         if mode == "partial":
-            return row_jacobian(lambda step: self.value_and_gradient(y + step)[1], start)[1]
+            return row_jacobian(lambda step: self.value_and_gradient(y + step)[1], start)[1].to(given)
         function = self._along(y, z, mode, target)
-        return row_jacobian(lambda step: row_jacobian(function, step)[1], start)[1]
+        return row_jacobian(lambda step: row_jacobian(function, step)[1], start)[1].to(given)
 
     def extra_repr(self) -> str:
         outputs = "" if self.out_features is None else f", out_features={self.out_features}"
@@ -265,28 +297,29 @@ class StaF(nn.Module):
             values: Tensor = self(y + shift)
             factor = log_factor.exp()
             return factor * values if self.out_features is None else factor.unsqueeze(-1) * values
-        moved = self.state.unsqueeze(-2) + step
+        moved = _wide(self.state).unsqueeze(-2) + step
         sigma = self.basis((y + step).unsqueeze(-2), moved)  # (..., P, 1, M)
         weights = self._weights(step.dim() - 2).unsqueeze(-2).unsqueeze(-2)
         return self._outputs_last((sigma * weights).sum(-1).squeeze(-1))
 
     def _moving(self, z: Tensor, step: Tensor, target: Target) -> Tensor:
         """V^(x + z + h; x + h) with the ideal weights of x + h: (..., P, n) -> (..., P), or (..., P, k)."""
-        moved = self.state.unsqueeze(-2) + step
+        moved = _wide(self.state).unsqueeze(-2) + step
         space = self.basis.local(moved)
         coefficients = space.fit(self.basis.values(moved, target, self.out_features))
         return self._outputs_last(space.evaluate(z.unsqueeze(-2), coefficients).squeeze(-1))
 
     def _weights(self, leading: int = 0) -> Tensor:
         """w, outputs first: NaN in a row where it cannot be represented."""
-        return self.basis.local(self.state).weights(self._outputs_first(leading))
+        return self.basis.local(_wide(self.state)).weights(self._outputs_first(leading))
 
     def _outputs_first(self, leading: int) -> Tensor:
         """The coefficients as (k, ..., M) with at least ``leading`` dimensions between, or as they are."""
+        coefficients = _wide(self.coefficients)
         if self.out_features is None:
-            return self.coefficients
+            return coefficients
         missing = max(0, leading - len(self.batch_shape))
-        return self.coefficients.movedim(-2, 0)[(slice(None), *[None] * missing)]
+        return coefficients.movedim(-2, 0)[(slice(None), *[None] * missing)]
 
     def _outputs_last(self, values: Tensor) -> Tensor:
         return values if self.out_features is None else values.movedim(0, -1)
@@ -320,3 +353,8 @@ class StaF(nn.Module):
         clone.__dict__.update({name: copy.deepcopy(v, memo) for name, v in self.__getstate__().items()})
         clone._remember(target)
         return clone
+
+
+def _wide(tensor: Tensor) -> Tensor:
+    """Return a tensor of a half type as float32, in which matrices can be factored; others as they are."""
+    return tensor.float() if tensor.dtype in (torch.float16, torch.bfloat16) else tensor

@@ -7,7 +7,7 @@ import abc
 import torch
 from torch import Tensor, nn
 
-from ..numerics.checks import fail, hold, non_negative, positive, shown, trailing
+from ..numerics.checks import fail, hold, kept, non_negative, positive, shown, trailing
 
 
 class Radius(nn.Module, abc.ABC):
@@ -57,10 +57,10 @@ class ConstantRadius(Radius):
         self.radius = hold(self, "radius", positive("ConstantRadius", "radius", radius))
 
     def bound(self) -> Tensor:
-        return self.radius
+        return kept(self, "radius")
 
     def forward(self, x: Tensor) -> Tensor:
-        return self.radius.to(x)
+        return kept(self, "radius").to(x)
 
 
 class StateRadius(Radius):
@@ -92,12 +92,16 @@ class StateRadius(Radius):
 
     def bound(self) -> Tensor:
         # nu is monotone in x'x, between radius * offset at the origin and radius / gain far out.
-        return self.radius * torch.maximum(self.offset, 1 / self.gain)
+        radius, offset, gain = self._numbers()
+        return radius * torch.maximum(offset, 1 / gain)
 
     def forward(self, x: Tensor) -> Tensor:
         square = x.square().sum(-1)
-        radius, offset, gain = self.radius.to(x), self.offset.to(x), self.gain.to(x)
+        radius, offset, gain = (number.to(x) for number in self._numbers())
         return radius * (square + offset) / (1 + gain * square)
+
+    def _numbers(self) -> tuple[Tensor, Tensor, Tensor]:
+        return kept(self, "radius"), kept(self, "offset", zero=True), kept(self, "gain")
 
 
 class StateFollowingCenters(nn.Module):

@@ -43,6 +43,7 @@ class Problem:
 
     def __post_init__(self) -> None:
         integer(self.call, "inner_steps", self.inner_steps, least=0)
+        self.basis.check_learned()
         if not isinstance(self.law, UpdateLaw):
             raise fail(self.call, "law", "must be an UpdateLaw", self.law)
         if self.predictor is not None and not isinstance(self.predictor, Predictor):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..numerics.checks import hold, positive
+from ..numerics.checks import hold, kept, positive
 from .base import Kernel, inner, per_entry, squared_distance, weighted_differences
 
 
@@ -61,7 +61,7 @@ class GaussianKernel(Kernel):
         return z * -per_entry(self.exponent_rate(), 2)
 
     def exponent_rate(self) -> Tensor:
-        return self.width.square().reciprocal()
+        return kept(self, "width", squared=True).square().reciprocal()
 
     def anchored(self, x1: Tensor, x2: Tensor) -> Tensor:
         rate = self.exponent_rate()

@@ -6,7 +6,7 @@ import math
 
 from torch import Tensor
 
-from ..numerics.checks import hold, integer, non_negative
+from ..numerics.checks import hold, integer, kept, non_negative
 from .base import Kernel, inner, per_entry
 
 
@@ -39,11 +39,15 @@ class PolynomialKernel(Kernel):
         """Whether the space holds all polynomials of the degree, not the homogeneous ones alone."""
 
     def forward(self, x1: Tensor, x2: Tensor) -> Tensor:
-        return (inner(x1, x2) + per_entry(self.bias, 2)).pow(self.degree)
+        return (inner(x1, x2) + per_entry(self.shift(), 2)).pow(self.degree)
 
     def gradient(self, x1: Tensor, x2: Tensor, b: Tensor) -> Tensor:
-        power = (inner(x1, x2) + per_entry(self.bias, 2)).pow(self.degree - 1)
+        power = (inner(x1, x2) + per_entry(self.shift(), 2)).pow(self.degree - 1)
         return (self.degree * power * b.unsqueeze(-2)) @ x2
+
+    def shift(self) -> Tensor:
+        """The bias, (...); a learned one stays on its side of the rule: positive where it began so."""
+        return kept(self, "bias", zero=not self.full)
 
     def rank(self, dim: int) -> int:
         variables = dim if self.full else dim - 1

@@ -7,7 +7,7 @@ import abc
 import torch
 from torch import Tensor
 
-from ..numerics.checks import hold, positive
+from ..numerics.checks import hold, kept, positive
 from .base import Kernel, per_entry, squared_distance, weighted_differences
 
 
@@ -41,7 +41,9 @@ class RadialKernel(Kernel):
         return None
 
     def forward(self, x1: Tensor, x2: Tensor) -> Tensor:
-        return self.profile(squared_distance(x1, x2) / per_entry(self.length_scale, 2).square())
+        return self.profile(
+            squared_distance(x1, x2) / per_entry(kept(self, "length_scale", squared=True), 2).square()
+        )
 
     def follow(self, y: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
         return torch.zeros_like(y[..., 0]), torch.zeros_like(y)  # translation invariant
@@ -50,7 +52,7 @@ class RadialKernel(Kernel):
         return self.forward(z, d)
 
     def gradient(self, x1: Tensor, x2: Tensor, b: Tensor) -> Tensor | None:
-        scale = per_entry(self.length_scale, 2).square()
+        scale = per_entry(kept(self, "length_scale", squared=True), 2).square()
         slope = self.slope(squared_distance(x1, x2) / scale)
         if slope is None:
             return None

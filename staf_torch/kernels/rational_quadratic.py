@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from ..numerics.checks import hold, positive
+from ..numerics.checks import hold, kept, positive
 from .base import per_entry
 from .radial import RadialKernel
 
@@ -34,9 +34,9 @@ class RationalQuadraticKernel(RadialKernel):
         self.alpha = hold(self, "alpha", positive("RationalQuadraticKernel", "alpha", alpha))
 
     def profile(self, s: Tensor) -> Tensor:
-        alpha = per_entry(self.alpha, 2)
+        alpha = per_entry(kept(self, "alpha"), 2)
         return ((s / (2 * alpha)).log1p() * -alpha).exp()
 
     def slope(self, s: Tensor) -> Tensor:
-        alpha = per_entry(self.alpha, 2)
+        alpha = per_entry(kept(self, "alpha"), 2)
         return -0.5 * ((s / (2 * alpha)).log1p() * -(alpha + 1)).exp()

@@ -89,11 +89,11 @@ class LocalBasis:
 
     def _series_serves(self, kernel: Kernel, centers: StateFollowingCenters) -> bool:
         """Return whether one series in the squared radius serves the fits at all states: `Interpolation`."""
+        if any(True for part in (kernel, centers.radius) for _ in part.parameters()):
+            return False  # what is learned may grow, and has derivatives that the series' setup has not
         rate, bound = kernel.exponent_rate(), centers.radius.bound()
         if rate is None or bound is None or self.degrees is None or bound.is_meta:
             return False
-        if any(True for part in (kernel, centers.radius) for _ in part.parameters()):
-            return False  # what is learned may grow, and has derivatives that the series' setup has not
         return bool((rate * (bound * self.degrees.reach).square()).amax() <= SERIES_BELOW)
 
     def _bound(self, kernel: Kernel, centers: StateFollowingCenters) -> Tensor | None:

@@ -158,7 +158,7 @@ def polynomial_space(
 
 def _square(kernel: PolynomialKernel, x: Tensor) -> Tensor:
     """s = bias + |x|^2: (..., n) -> (...)."""
-    return kernel.bias.to(x) + x.square().sum(-1)
+    return kernel.shift().to(x) + x.square().sum(-1)
 
 
 def _projection(kernel: PolynomialKernel, x: Tensor, z: Tensor) -> Tensor:
@@ -173,7 +173,7 @@ def _root(kernel: PolynomialKernel, x: Tensor, z: Tensor) -> Tensor:
     which has no 0/0 at the origin.
     """
     s = _square(kernel, x)
-    ratio = (kernel.bias.to(x) / s).sqrt()
+    ratio = (kernel.shift().to(x) / s).sqrt()
     along = (z * x.unsqueeze(-2)).sum(-1) / (s * (1 + ratio)).unsqueeze(-1)
     return (z - along.unsqueeze(-1) * x.unsqueeze(-2)) / s.sqrt()[..., None, None]
 

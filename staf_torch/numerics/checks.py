@@ -165,6 +165,43 @@ def hold(module: nn.Module, name: str, value: Tensor) -> Tensor:
     return value
 
 
+def kept(module: nn.Module, name: str, *, zero: bool = False, squared: bool = False) -> Tensor:
+    """Return a hyperparameter of `hold`, and refuse a learned one that training has taken out of its rule.
+
+    A fixed one was checked when it was given. Inside `torch.compile` the check is an assertion.
+
+    Args:
+        module: that holds it.
+        name: of the hyperparameter.
+        zero: whether zero is allowed too.
+        squared: whether its square must be positive too, in the precision that it has.
+
+    Raises:
+        ValueError: if a learned one is not positive (with ``zero``: is negative), or not finite.
+    """
+    value: Tensor = getattr(module, name)
+    if not (value.requires_grad or name in module._parameters) or value.is_meta:
+        return value
+    least = torch.finfo(value.dtype).tiny ** 0.5 if squared else 0.0
+    rule = f"`{type(module).__name__}({name}=...)` must " + ("not fall below" if zero else "stay above")
+    rule += f" {least:.3g} while it is learned"
+    if torch.compiler.is_compiling():
+        if torch.compiler.is_dynamo_compiling():
+            inside = (value >= least if zero else value > least) & (value < math.inf)
+            torch._assert_async(inside.all(), f"{rule}.")
+    elif not torch._C._len_torch_dispatch_stack():  # a tracer has no values
+        plain = value.detach()
+        while torch._C._functorch.is_functorch_wrapped_tensor(plain):  # inside a transform of torch.func
+            plain = torch._C._functorch.get_unwrapped(plain)
+        for number in [plain.item()] if plain.dim() == 0 else plain.flatten().tolist():
+            if not least <= number < math.inf or (number == least and not zero):
+                raise ValueError(
+                    f"{rule}, and finite; got {number:.6g}. Take smaller steps, or learn its logarithm, with "
+                    "which it cannot leave (approximation/README.md)."
+                )
+    return value
+
+
 def copied(module: Module, **buffers: Tensor) -> Module:
     """A shallow copy of a module, with other tensors in place of some; not checked."""
     other = copy.copy(module)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -19,10 +19,10 @@ class ChaseOptimizer(Optimizer):
     """An update law on any torch loss that is quadratic in its parameters.
 
     A parameter (..., M) holds one independent problem a leading row: the loss is the sum over rows, or a
-    tensor of row losses, and no row's loss may depend on another row or on another parameter's rows. The
-    slope and the curvature come from autograd (double backward), the curvature exactly, one
-    Hessian-vector product where `chase` has a product with K. Each `step` is a new objective (`begin`)
-    and ``inner_steps`` iterations.
+    tensor of row losses, and no row's loss may depend on another row or on another parameter's rows; the
+    steps 1, 2, 4, 8, ... check that by two products with the curvature a parameter. The slope and the
+    curvature come from autograd (double backward), the curvature exactly, one Hessian-vector product where
+    `chase` has a product with K. Each `step` is a new objective (`begin`) and ``inner_steps`` iterations.
 
     Example:
         >>> weights = torch.zeros(5, 3, dtype=torch.float64, requires_grad=True)
@@ -43,7 +43,8 @@ class ChaseOptimizer(Optimizer):
 
     Raises:
         ValueError: if an argument breaks its rule, or `step` gets no closure, or one that does not
-            return a differentiable loss.
+            return a differentiable loss, or one that couples rows or parameters: by name, with
+            the curvature between them.
     """
 
     def __init__(self, params: ParamsT, law: UpdateLaw, *, inner_steps: int = 1) -> None:
@@ -51,7 +52,7 @@ class ChaseOptimizer(Optimizer):
             raise fail("ChaseOptimizer", "law", "must be an UpdateLaw", law)
         if "sampled" in law.needs:
             raise fail("ChaseOptimizer", "law", "must not need a sample at a state, as a loss has none", law)
-        self.law = law
+        self.law, self._steps = law, 0
         defaults: dict[str, Any] = {"inner_steps": inner_steps}
         if law.step_size is not None:
             defaults["lr"] = law.step_size
@@ -84,13 +85,30 @@ class ChaseOptimizer(Optimizer):
         with torch.enable_grad():
             loss = closure()
         groups = [(group, p) for group in self.param_groups for p in group["params"] if p.requires_grad]
+        slopes = _slopes(loss, [p for _, p in groups])
+        self._steps += 1
+        if self._steps & (self._steps - 1) == 0:  # a power of two: what couples may come later than the first
+            _check_independent(self._names(), [p for _, p in groups], slopes)
         moved = []
-        for (group, parameter), slope in zip(groups, _slopes(loss, [p for _, p in groups]), strict=True):
+        for (group, parameter), slope in zip(groups, slopes, strict=True):
             if slope is not None and group.get("lr") != 0:
                 moved.append((parameter, self._advanced(group, parameter, slope)))
         for parameter, weights in moved:  # only now: the curvature was taken at the old parameters
             parameter.copy_(weights)
         return loss.detach()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For copies and pickle: torch's own keeps neither the law nor the count."""
+        return {**super().__getstate__(), "law": self.law, "_steps": self._steps}
+
+    def _names(self) -> list[str]:
+        """Names of the parameters that are moved, as they were given or by their place."""
+        return [
+            f"`{group['param_names'][k]}`" if "param_names" in group else f"parameter {k} of group {g}"
+            for g, group in enumerate(self.param_groups)
+            for k, parameter in enumerate(group["params"])
+            if parameter.requires_grad
+        ]
 
     def _advanced(self, group: dict[str, Any], parameter: Tensor, slope: Tensor) -> Tensor:
         """The parameter's new value."""
@@ -170,3 +188,63 @@ def _slopes(loss: object, parameters: list[Tensor]) -> tuple[Tensor | None, ...]
             "`ChaseOptimizer.step(closure=...)` must return the loss without calling `backward` on it; "
             f"autograd says: {error}"
         ) from error
+
+
+def _check_independent(names: list[str], parameters: list[Tensor], slopes: Sequence[Tensor | None]) -> None:
+    """Refuse parameters and rows between which the loss has curvature.
+
+    H v has no entry of another parameter, and H (s v) = s H v for one number s a row, where the rows are
+    independent; with s different in every row and v at random, not otherwise.
+
+    Args:
+        names: of the parameters.
+        parameters: (..., M).
+        slopes: of the loss in them, with their graphs; None where it does not depend on one.
+
+    Raises:
+        ValueError: if two are coupled.
+    """
+    for name, parameter, slope in zip(names, parameters, slopes, strict=True):
+        if slope is None or not slope.requires_grad:
+            continue
+        generator = torch.Generator().manual_seed(0)
+        v = torch.randn(parameter.shape, dtype=torch.float64, generator=generator).to(parameter)
+        rows = torch.linspace(1, 2, v[..., 0].numel(), dtype=torch.float64).to(v).view_as(v[..., :1])
+        own = _curvature(slope, parameter, v)
+        size, rounding = float(own.norm()), torch.finfo(v.dtype).eps ** 0.5
+        for other, its in zip(names, parameters, strict=True):
+            between = _curvature(slope, its, v).norm() if its is not parameter else v.new_zeros(())
+            if float(between) > rounding * size:
+                raise ValueError(
+                    f"`ChaseOptimizer(params=...)` must be independent of each other: the curvature of the "
+                    f"loss between {name} and {other} is {_times(float(between), size)} of {name} itself. "
+                    "Make them one parameter, or leave one of them to another optimizer."
+                )
+        apart = (_curvature(slope, parameter, rows * v) - rows * own).norm(dim=-1)
+        whole = own.norm(dim=-1)
+        coupled = apart > rounding * whole + torch.finfo(v.dtype).eps * whole.amax()
+        if bool(coupled.any()):
+            first = tuple(coupled.nonzero()[0].tolist())
+            alone = torch.zeros_like(v)
+            alone[first] = v[first]
+            found = _curvature(slope, parameter, alone).norm(dim=-1)
+            within = float(found[first])
+            found[first] = 0
+            second = tuple((found == found.max()).nonzero()[0].tolist())
+            raise ValueError(
+                f"`ChaseOptimizer(params=...)` must have rows that are independent problems: in {name} of "
+                f"the shape {tuple(parameter.shape)} the curvature of the loss between the rows {first} and "
+                f"{second} is {_times(float(found.max()), within)} of row {first} itself. Make what belongs "
+                "together one row (..., M), or take another optimizer."
+            )
+
+
+def _times(size: float, other: float) -> str:
+    return f"{size / other if other else torch.inf:.3g} times that"
+
+
+def _curvature(slope: Tensor, parameter: Tensor, direction: Tensor) -> Tensor:
+    """The product of the mixed second derivatives with a direction of the slope, in the parameter."""
+    with torch.enable_grad():
+        (product,) = torch.autograd.grad(slope, parameter, direction, retain_graph=True, allow_unused=True)
+    return torch.zeros_like(parameter) if product is None else product.detach()

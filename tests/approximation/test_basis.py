@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import warnings
 
 import mpmath
 import pytest
@@ -11,7 +12,7 @@ import torch
 from helpers import basis_of, centers_of, tensor, uniform
 from hypothesis import given, settings
 from hypothesis import strategies as some
-from variants import KERNELS, TARGETS, over
+from variants import KERNELS, LAYOUTS, RADII, TARGETS, over
 
 import staf_torch as st
 from staf_torch.approximation import conditioning
@@ -29,6 +30,44 @@ def test_basis_is_the_kernel_at_the_centers(name: str, batch: tuple[int, ...]) -
     assert basis(y, x).shape == (*batch, 5, 6)
     assert torch.equal(basis(y, x), basis.kernel(y, basis.centers(x)))
     assert torch.equal(basis.gram(x), basis(basis.centers(x), x))
+
+
+class Tilted(st.Kernel):
+    """The Gaussian kernel, which no class or attribute says: e^{y'c} / sqrt(e^{y'y} e^{c'c})."""
+
+    def forward(self, x1: torch.Tensor, x2: torch.Tensor) -> torch.Tensor:
+        return torch.exp(
+            x1 @ x2.mT - x1.square().sum(-1)[..., None] / 2 - x2.square().sum(-1)[..., None, :] / 2
+        )
+
+
+OWN = {**{name: case.make for name, case in KERNELS.items()}, "tilted": Tilted}
+
+
+@pytest.mark.parametrize("layout", ["rings6", "polygon1", "ball_of_one"])
+@over({**RADII, "as_good_as_constant": (lambda: st.StateRadius(0.3, 0.5, gain=2.0),)}, "radius")
+@over(OWN)
+def test_a_basis_that_is_the_same_at_every_state_says_so_once(name: str, radius: str, layout: str) -> None:
+    made = {**RADII, "as_good_as_constant": (lambda: st.StateRadius(0.3, 0.5, gain=2.0),)}[radius][0]()
+    basis = st.StaFBasis(OWN[name](), st.StateFollowingCenters(LAYOUTS[layout].make(), made))
+    x = uniform(3, basis.dim, low=0.2, seed=1)
+    alone = [basis.kernel(at[None], basis.centers(at)) for at in (*x, torch.zeros_like(x[0]))]
+    constant = all(torch.allclose(one, alone[0], rtol=1e-9, atol=0) for one in alone)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        basis(x.unsqueeze(-2) + 0.1, x)  # elsewhere
+        assert not said
+        basis(x[:1], x[0])  # a state without a batch
+        basis(x.unsqueeze(-2), x)
+    assert len(said) == int(constant)
+    if constant:
+        assert re.search(
+            r"change of basis\(x, x\) between states: [0-9.e-]+\): .* is a constant", str(said[0].message)
+        )
+        assert said[0].filename == __file__
+        assert not st.StaFBasis(st.AnchoredKernel(OWN[name]()), basis.centers).check_own_value(
+            x
+        )  # as it says
 
 
 @over(KERNELS)

@@ -231,7 +231,7 @@ def test_copies_are_the_same_function_and_apart(name: str) -> None:
     with pytest.raises(ValueError, match="needs a target"):  # a lambda could not be pickled
         pickled.gradient(y, "total")
     staf.reset_parameters()
-    assert torch.equal(staf(y), torch.zeros(2, 3).double())
+    assert not torch.isclose(staf(y), before).any()
     assert torch.equal(copied(y), before)
     assert torch.equal(pickled(y), before)
 

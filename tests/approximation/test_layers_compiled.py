@@ -39,9 +39,14 @@ def test_the_whole_layer_is_one_graph(name: str) -> None:
         return staf.value_and_gradient(at) if mode is None else (staf(at), staf.gradient(at, mode))
 
     torch.compiler.reset()
-    compiled = torch.compile(everything, fullgraph=True, backend="eager")(y)
-    for found, expected in zip(compiled, everything(y), strict=True):
+    compiled = torch.compile(everything, fullgraph=True, backend="eager")
+    for found, expected in zip(compiled(y), everything(y), strict=True):
         torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
+    staf.basis.centers.radius.radius.data.fill_(-1.2)  # an assertion of the graph
+    with pytest.raises(
+        RuntimeError, match=r"`StateRadius\(radius=...\)` must stay above 0 while it is learned"
+    ):
+        compiled(y)
 
 
 @pytest.mark.needs_compiler

@@ -153,8 +153,23 @@ def test_coefficients_are_parameters_that_a_loss_can_train() -> None:
     assert [name for name, _ in staf.named_parameters()] == ["coefficients"]
 
 
-def test_an_unfitted_module_is_zero_everywhere() -> None:
-    assert torch.equal(st.StaF(basis_of("gaussian"))(uniform(5, 2)), torch.zeros(5).double())
+def test_a_module_that_does_not_learn_or_is_asked_to_begins_at_zero() -> None:
+    for given in ({"init": "zeros"}, {"learnable": False}):
+        assert torch.equal(st.StaF(basis_of("gaussian"), **given)(uniform(5, 2)), torch.zeros(5).double())
+    with pytest.raises(ValueError, match=r"`StaF\(init=...\)` must be one of 'random', 'zeros'; got 'ones'"):
+        st.StaF(basis_of("gaussian"), init="ones")
+
+
+@over(KERNELS)
+@over(RADII, "radius")
+def test_a_layer_begins_near_linear_functions_of_the_size_of_a_linear_layer(name: str, radius: str) -> None:
+    staf = st.StaF(basis_of(name, 6, RADII[radius][0]()), (3,), 40)
+    ball = staf.basis.centers(staf.state[0])
+    slopes = staf.gradient(ball)  # (3, 6, 40, 2)
+    assert 0.2 < float(slopes.detach().square().mean().sqrt()) < 0.8  # 1 / sqrt(6) for exact ones
+    anchored = float(staf(torch.zeros(1, 2).double()).detach().abs().max()) < 1e-9
+    assert anchored == name.startswith("anchored")
+    assert float(staf(ball).detach().abs().max()) < 3
 
 
 @pytest.mark.parametrize(
@@ -238,7 +253,9 @@ def test_a_model_without_values_says_how_it_gets_them() -> None:
 
 def test_what_is_reset_is_as_new() -> None:
     staf = fitted("gaussian", (3,))
+    torch.manual_seed(1)
     staf.reset_parameters()
+    torch.manual_seed(1)
     for name, held in st.StaF(staf.basis, (3,)).state_dict().items():
         assert torch.equal(staf.state_dict()[name], held), name
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import io
+import re
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -10,8 +13,21 @@ from torch import Tensor, nn
 from torch.func import functional_call, grad, vmap
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torch.utils.checkpoint import checkpoint
+from variants import KERNELS, LEARNABLE_KERNELS, learned, over
 
-from staf_torch import GaussianKernel, StaF, StaFBasis, StateFollowingCenters, rings
+from staf_torch import (
+    GaussianKernel,
+    PolynomialKernel,
+    RationalQuadraticKernel,
+    StaF,
+    StaFBasis,
+    StateFollowingCenters,
+    StateRadius,
+    chase,
+    optim,
+    rings,
+    targets,
+)
 
 
 class Head(nn.Module):
@@ -120,3 +136,169 @@ def test_saved_weights_load_with_weights_only(points: Tensor) -> None:
     again = Head()
     again.load_state_dict(torch.load(file, weights_only=True))
     assert torch.equal(again(points), head(points))
+
+
+# Between the layers of somebody's network.
+
+
+def around(kernel: str, outputs: int | None = None, radius: object = 0.5) -> StaF:
+    return StaF(StaFBasis(KERNELS[kernel].make(), StateFollowingCenters(rings(6), radius)), (), outputs)
+
+
+@over(KERNELS)
+def test_everything_learns_from_the_first_step_behind_and_before_a_layer(name: str, points: Tensor) -> None:
+    net = nn.Sequential(nn.Linear(2, 2), around(name, 8), nn.ReLU(), nn.Linear(8, 1))  # without .float()
+    adam, losses = torch.optim.Adam(net.parameters(), lr=0.02), []
+    for step in range(60 if name == "gaussian" else 1):
+        loss = (net(points).squeeze(-1) - wanted(points)).square().mean()
+        adam.zero_grad()
+        loss.backward()
+        if step == 0:
+            assert all(bool(p.grad.abs().max() > 1e-4) for p in net.parameters())
+        adam.step()
+        losses.append(float(loss.detach()))
+    assert len(losses) == 1 or losses[-1] < 0.05 * losses[0]
+    alone = around(name)
+    alone(points).relu().sum().backward()
+    assert bool(alone.coefficients.grad.any())
+
+
+@pytest.mark.parametrize(
+    ("held_in", "points_in"),
+    [
+        (torch.float64, torch.float32),
+        (torch.float64, torch.float16),
+        (torch.float32, torch.float64),
+        (torch.bfloat16, torch.bfloat16),
+        (torch.float16, torch.float32),
+    ],
+)
+@over(KERNELS)
+def test_values_are_of_the_dtype_of_the_points(
+    name: str, held_in: torch.dtype, points_in: torch.dtype, points: Tensor
+) -> None:
+    staf = around(name, 2)
+    y = (0.5 * points).to(points_in)
+    exact = staf(y.double()).detach()
+    staf.to(held_in)
+    least = max(torch.finfo(held_in).eps, torch.finfo(points_in).eps)
+    (values, slopes), one = staf.value_and_gradient(y), staf.rowwise(y)
+    assert values.dtype == slopes.dtype == one.dtype == staf(y[:0]).dtype == points_in
+    torch.testing.assert_close(staf(y).double(), exact, rtol=0, atol=100 * least)
+    assert staf.gradient(y, "total_frozen_weights").dtype == staf.hessian(y).dtype == points_in
+
+
+def test_a_network_of_another_precision_as_target_is_refused_in_a_sentence(points: Tensor) -> None:
+    net = nn.Linear(2, 1)
+    with pytest.raises(
+        ValueError, match=r"must take points of torch.float64, .* by `.double\(\)` or `.float\(\)`"
+    ):
+        around("gaussian").fit_(torch.zeros(2, dtype=torch.float64), lambda y: net(y).squeeze(-1))
+    with pytest.raises(ValueError, match=r"must be of float32 or float64.*got torch.bfloat16"):
+        around("gaussian").basis.ideal_weights(points.bfloat16(), targets.Paper())
+
+
+HELD: dict[str, Callable[[nn.Parameter], StaFBasis]] = {
+    **{
+        name: lambda p, make=make: StaFBasis(make(p), StateFollowingCenters(rings(3), 0.3))
+        for name, make in (
+            ("GaussianKernel(width", GaussianKernel),
+            ("MaternKernel(length_scale", lambda p: type(LEARNABLE_KERNELS["matern52"]())(2.5, p)),
+            ("RationalQuadraticKernel(alpha", lambda p: RationalQuadraticKernel(p)),
+            ("RationalQuadraticKernel(length_scale", lambda p: RationalQuadraticKernel(1.0, p)),
+            ("PolynomialKernel(bias", lambda p: PolynomialKernel(2, p)),
+        )
+    },
+    **{
+        name: lambda p, make=make: StaFBasis(
+            KERNELS["anchored_gaussian"].make(), StateFollowingCenters(rings(3), make(p))
+        )
+        for name, make in (
+            ("ConstantRadius(radius", lambda p: p),
+            ("StateRadius(radius", lambda p: StateRadius(p, 0.1)),
+            ("StateRadius(offset", lambda p: StateRadius(0.5, p)),
+            ("StateRadius(gain", lambda p: StateRadius(0.5, 0.1, p)),
+        )
+    },
+}
+
+
+@over(HELD)
+def test_what_learning_takes_out_of_its_rule_is_refused_by_name(name: str) -> None:
+    given = learned(0.8)
+    dtype = torch.float32 if name.startswith(("G", "S")) else torch.float64
+    staf, y, states = (
+        StaF(HELD[name](given)).to(dtype),
+        torch.rand(4, 2, dtype=dtype),
+        torch.rand(1, 3, 2).to(dtype),
+    )
+    said = re.escape(f"`{name}=...)` must ")
+    for wrong in (-1.2, float("nan"), float("inf")):
+        given.data.fill_(wrong)  # past the version that torch counts
+        for call in (
+            lambda: staf(y),
+            lambda: staf.value_and_gradient(y),
+            lambda: staf.basis(y, y[0]),
+            lambda: staf.basis.gram_structure(y),
+            lambda: copy.deepcopy(staf).requires_grad_(False)(y),
+            lambda: chase(states, staf.basis, targets.Paper(), optim.Exact()),
+        ):
+            with torch.no_grad(), pytest.raises(ValueError, match=rf"{said}.*got {wrong}"):
+                call()
+    given.data.fill_(0.5)
+    assert bool(staf(y).isfinite().all())
+    key = next(key for key, p in staf.named_parameters() if p is given)
+    assert key.endswith(name.split("(")[1])
+    each = vmap(lambda p: functional_call(staf, {key: p}, (y,)))
+    assert each(torch.tensor([0.4, 0.5], dtype=dtype)).shape == (2, 4)
+    with pytest.raises(ValueError, match=r"got -0.2"):
+        each(torch.tensor([0.4, -0.2], dtype=dtype))
+
+
+def test_a_learned_width_whose_square_is_nothing_is_refused(points: Tensor) -> None:
+    given = nn.Parameter(torch.tensor(1e-30))  # 1e-60 is 0 in float32
+    with pytest.raises(
+        ValueError, match=r"`GaussianKernel\(width=...\)` must stay above 1.08e-19 .* got 1e-30"
+    ):
+        StaF(HELD["GaussianKernel(width"](given), init="zeros")(points)
+
+
+class Exp(nn.Module):
+    def forward(self, logarithm: Tensor) -> Tensor:
+        return logarithm.exp()
+
+    def right_inverse(self, value: Tensor) -> Tensor:
+        return value.log()
+
+
+def test_a_learned_logarithm_never_leaves_and_is_carried_by_copies(points: Tensor) -> None:
+    def made() -> StaF:
+        basis = StaFBasis(GaussianKernel(learned(0.8)), StateFollowingCenters(rings(3), learned(0.1)))
+        staf = StaF(basis)
+        nn.utils.parametrize.register_parametrization(basis.kernel, "width", Exp())
+        nn.utils.parametrize.register_parametrization(basis.centers.radius, "radius", Exp())
+        return staf
+
+    staf = made()
+    optimizer = torch.optim.SGD(staf.parameters(), lr=3.0)
+    for _ in range(10):
+        optimizer.zero_grad()
+        (staf.basis.kernel.width + staf.basis.centers.radius(points) + 0 * staf(points).sum()).backward()
+        optimizer.step()
+    assert 0 < float(staf.basis.kernel.width.detach()) < 0.1
+    again = made()
+    again.load_state_dict(staf.state_dict())
+    assert torch.equal(again(points), staf(points))
+    assert torch.equal(copy.deepcopy(staf)(points), staf(points))
+
+
+def test_initialisers_are_applied_to_the_layer(points: Tensor) -> None:
+    net = nn.Sequential(nn.Linear(2, 2), around("gaussian", 3))
+    before = net(points).detach()
+    torch.manual_seed(5)
+    net.apply(lambda m: m.reset_parameters() if hasattr(m, "reset_parameters") else None)
+    first = net(points).detach()
+    torch.manual_seed(5)
+    net.apply(lambda m: m.reset_parameters() if hasattr(m, "reset_parameters") else None)
+    assert torch.equal(net(points), first)
+    assert not torch.equal(first, before)

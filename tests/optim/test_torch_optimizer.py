@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import io
+import re
 
 import pytest
 import torch
@@ -143,6 +144,47 @@ def test_what_it_cannot_use_is_refused_in_a_sentence() -> None:
 
     with pytest.raises(ValueError, match="without calling `backward`"):
         optimizer.step(backward)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("shape", [(5, 3), (2, 3, 4)])
+def test_rows_that_are_coupled_are_refused_with_the_curvature_between_them(
+    shape: tuple[int, ...], dtype: torch.dtype
+) -> None:
+    weights, coupling = nn.Parameter(uniform(*shape).to(dtype)), 0.0
+
+    def loss() -> Tensor:
+        rows = weights.flatten(0, -2)
+        return weights.square().sum() + coupling * (rows[0] - rows[-1]).square().sum()
+
+    optimizer = optim.ChaseOptimizer([("coefficients", weights)], optim.FixedStep(0.5))
+    optimizer.step(loss)
+    coupling, before = 0.25, weights.detach().clone()  # later than the first step
+    last = tuple(n - 1 for n in shape[:-1])
+    said = (
+        f"`coefficients` of the shape {shape} the curvature of the loss between the rows {(0,) * len(last)}"
+    )
+    with pytest.raises(ValueError, match=re.escape(f"{said} and {last} is 0.2 times that of row")):
+        optimizer.step(loss)
+    assert torch.equal(weights, before)
+    chased = optim.ChaseOptimizer([weights], optim.Exact())
+    with pytest.raises(ValueError, match="rows that are independent problems: in parameter 0 of group 0"):
+        chased.step(lambda: weights.sum(0).square().sum())
+
+
+def test_parameters_that_are_coupled_are_refused_by_name() -> None:
+    a, b = (nn.Parameter(torch.ones(4, dtype=torch.float64)) for _ in range(2))
+    with pytest.raises(ValueError, match=r"of the loss between `a` and `b` is 2 times that of `a` itself"):
+        optim.ChaseOptimizer([("a", a), ("b", b)], optim.Exact()).step(
+            lambda: a.square().sum() + b.square().sum() + 4 * (a @ b)
+        )
+    apart = optim.ChaseOptimizer([{"params": [a]}, {"params": [b]}], optim.Exact())
+    with pytest.raises(ValueError, match="parameter 0 of group 0 and parameter 0 of group 1 is inf times"):
+        apart.step(lambda: (a * b).sum())
+    copied = copy.deepcopy(optim.ChaseOptimizer([a], optim.SteepestDescent()))
+    (mine,) = copied.param_groups[0]["params"]
+    copied.step(lambda: mine.square().sum())
+    assert not bool(mine.any())
 
 
 GRAM, VALUES = random_positive_definite(1, 4, size=3), uniform(4, 3, seed=2)

@@ -69,7 +69,8 @@ class StaFValueBasis(ValueBasis):
 
         partial = e^{y'c_i} c_i,   total = e^{y'c_i} (c_i + y + grad nu(x) u_i'y);
 
-    every other kernel is differentiated automatically.
+    every other kernel is differentiated automatically. A basis whose value at its own state is the same
+    everywhere is warned of (`StaFBasis.check_own_value`): its total gradient is zero, and so is the policy.
 
     Example:
         >>> centers = StateFollowingCenters(rings(3), StateRadius(0.7, offset=1e-5))
@@ -95,6 +96,7 @@ class StaFValueBasis(ValueBasis):
         if not isinstance(basis, StaFBasis):
             raise ValueError(f"`StaFValueBasis(basis=...)` must be a StaFBasis; got {basis!r}.")
         choice("StaFValueBasis", "gradient", gradient, ("total", "partial"))
+        basis.check_own_value(basis.centers.directions.new_zeros(basis.dim), stacklevel=3)
         self.basis = basis
         self.mode = gradient
         self.count, self.dim = basis.count, basis.dim

@@ -59,6 +59,7 @@ class Growing(Radius):
         return 0.2 + 0.3 * x[..., 0].square()
 
 
+@pytest.mark.filterwarnings("ignore:StaFBasis of GaussianKernel has the same values at every state")
 @pytest.mark.parametrize("mode", ["total", "partial"])
 @pytest.mark.parametrize(
     "radius", [0.4, st.StateRadius(0.7, 0.2, gain=1.5), Growing()], ids=["constant", "shrinking", "own"]
