@@ -21,6 +21,7 @@ from torch import Tensor, nn
 
 from .call import PlannedCall, ordinary
 from .contents import BOUND, Contents
+from .locks import Mutex
 from .loops import tracing_now
 from .plain_time import PlainTime
 from .program import Program
@@ -123,11 +124,13 @@ class compiled:  # noqa: N801
         if owner is None:
             return self
         bound = vars(owner).get(BOUND)
-        if bound is None or bound.owner is not owner:  # none, or that of which the owner is a shallow copy
+        if bound is None:
+            bound = vars(owner).setdefault(BOUND, _Bound(owner))
+        if bound.owner is not owner:  # that of which the owner is a shallow copy
             bound = vars(owner)[BOUND] = _Bound(owner)
         method: CompiledMethod | None = bound.get(self)
         if method is None:
-            method = bound[self] = CompiledMethod(MethodType(self.definition, owner), owner, self)
+            method = bound.setdefault(self, CompiledMethod(MethodType(self.definition, owner), owner, self))
         return method
 
 
@@ -154,7 +157,8 @@ class CompiledMethod:
         self.definition, self.owner, self._settings = definition, owner, settings
         self._asked, self.waits = 0.0, False  # whether it was to be compiled, and has not been called since
         self._plain: tuple[PlainTime, float] | None = None  # of its first call, with so many rows
-        self._served: Served | None = None
+        self._lock = Mutex()
+        self._served: Served | None = None  # written before what it has read
         self._read: Contents | None = None
 
     @overload
@@ -170,7 +174,7 @@ class CompiledMethod:
             if not self._pays(rows):
                 return self._counted(rows, x, *more)
         if self._read is None or not self._read.unchanged(library=False):
-            self._served = self._compile(trees=bool(more))
+            self._compile(trees=bool(more))
         self.waits = False
         assert self._served is not None
         if more:
@@ -217,13 +221,20 @@ class CompiledMethod:
         """Compile at the next call, whatever it pays."""
         self._asked, self.waits = math.inf, True
 
-    def _compile(self, trees: bool) -> Served:
-        settings, self._read = self._settings, Contents(self.definition, self.owner)
-        self._read.warn(settings.name)
-        if settings.by is not None:
-            return settings.by(self.owner)
-        rows = Rows(self.definition, settings.name, self.definition, self.owner, copies=settings.copies)
-        return _Trees(rows) if trees else rows
+    def _compile(self, trees: bool) -> None:
+        with self._lock:
+            if self._read is not None and self._read.unchanged(library=False):
+                return  # another thread has
+            settings, read = self._settings, Contents(self.definition, self.owner)
+            read.warn(settings.name)
+            served: Served
+            if settings.by is not None:
+                served = settings.by(self.owner)
+            else:
+                made = self.definition, settings.name, self.definition, self.owner
+                rows = Rows(*made, copies=settings.copies)
+                served = _Trees(rows) if trees else rows
+            self._served, self._read = served, read
 
 
 def ready(module: nn.Module, x: Tensor) -> bool:

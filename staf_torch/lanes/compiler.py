@@ -14,11 +14,11 @@ import shutil
 import signal
 import subprocess
 import tempfile
-import threading
 from collections.abc import Callable
 from pathlib import Path
 
 from .cache import cache, used
+from .locks import Mutex
 
 COMPILERS = ("g++", "c++", "clang++")
 """Names that are looked for where `CXX` names none."""
@@ -35,7 +35,7 @@ _OF_PROGRAMS = ("-O2", *_SHARED, "-w", *_ROUNDED_AS_WRITTEN)
 _LONG, _OF_LONG = 1500, ("-fira-region=one", "-fno-tree-pre", "-fno-gcse")  # lines
 _SLOW = 6000  # lines from which a user hears of it: some seconds
 _DIGEST = 32  # bytes at the end of a library in the cache
-_one_at_a_time = threading.Lock()  # threads of a chase ask for the same at the same time
+_one_at_a_time = Mutex()  # threads of a chase ask for the same at the same time
 _said: set[str] = set()  # what has been logged
 _programs: dict[str, Callable[..., None]] = {}  # by their text
 

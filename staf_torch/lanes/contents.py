@@ -158,7 +158,7 @@ class Contents:
                 and all(now.tobytes() == then for now, then in self._arrays)
                 and not (library and self.replaced(self._methods))
             )
-        except KeyError:  # an attribute is gone
+        except (KeyError, RuntimeError):  # an attribute is gone, or comes from another thread meanwhile
             return False
 
     def methods(self) -> list[Any]:

@@ -9,10 +9,12 @@ import weakref
 from collections.abc import Callable
 from typing import Any, TypeVar
 
+from .contents import Derived
+
 Some = TypeVar("Some")
 
 
-class Mutex:
+class Mutex(Derived):
     """Reentrant lock that is free in a child of a fork, whoever held it, and new in a copy of its owner."""
 
     def __init__(self) -> None:
@@ -42,16 +44,16 @@ class ReadWriteLock(Mutex):
 
     def _renew(self) -> None:
         super()._renew()
-        self._readers: dict[object, None] = {}
+        self._readers: dict[object, int] = {}  # and their threads
         self._writing = False
 
     def read(self, function: Callable[..., Some], *given: Any) -> Some:
-        """Return function(*given) while nobody writes; a writer may read, a reader must not write."""
+        """Return function(*given) while nobody writes; who reads or writes may read, who reads must not write."""
         reader = object()
         try:  # begins before the entry, and an interrupt leaves none behind
-            self._readers[reader] = None
-            if not self._writing:
-                return function(*given)
+            self._readers[reader] = thread = threading.get_ident()
+            if not self._writing or [*self._readers.values()].count(thread) > 1:
+                return function(*given)  # nobody writes, or waits until this thread has read
         finally:
             self._readers.pop(reader, None)
         with self._lock:

@@ -16,6 +16,7 @@ from .compiler import machine_code
 from .contents import Contents, Derived
 from .emit.c import Names, c_text
 from .emit.cpp import emit
+from .locks import Mutex
 from .loops import scan, tracing_now
 from .row_independence import doubt, undrawn
 from .trace.step import Step, trace
@@ -64,6 +65,7 @@ class Program(Derived):
 
     def __init__(self, step: Step, *, name: str = "program", compile: bool = True, copies: int = 0) -> None:
         self.step, self.name, self.compile, self.copies = step, name, compile, copies
+        self._lock = Mutex()  # of what is built: one thread builds, the others wait for it
         self._compiled: dict[Hashable, _Built | None] = {}
         self._prepared: dict[Hashable, Prepared] = {}
         self._model: tuple[Program, Mapping[int, Tensor]] | None = None
@@ -132,11 +134,12 @@ class Program(Derived):
         self._look_around()
         leaves, structure = flatten((row, now, carry))
         key = structure, tuple(map(form, leaves)), steps, every
-        prepared = self._prepared.get(key)
+        known = self._prepared  # of this step: another dictionary takes its place where that changes
+        prepared = known.get(key)
         if prepared is None:
-            if len(self._prepared) >= _PREPARED:
-                self._prepared.clear()
-            prepared = self._prepared[key] = self.prepare(carry, now, row, steps=steps, every=every)
+            if len(known) >= _PREPARED:
+                known.clear()
+            prepared = known[key] = self.prepare(carry, now, row, steps=steps, every=every)
         return prepared.run(leaves, carry, now, row)
 
     def over(self, points: tuple[Tensor, ...], fixed: tuple[Tensor, ...] = ()) -> Tree:
@@ -248,7 +251,10 @@ class Program(Derived):
             return None
         copies = self.copies or int(given.rows <= _FEW)
         key = given.key(), copies
-        with torch.device("cpu"):  # what the step makes is where its inputs are, not on a default device
+        with (
+            self._lock,
+            torch.device("cpu"),
+        ):  # what the step makes is where its inputs are, not on a default device
             if key not in self._compiled:
                 self._compiled[key] = self._again(key) or self._build(given, copies)
             built = self._compiled[key]
@@ -268,11 +274,14 @@ class Program(Derived):
 
     def _look_around(self) -> None:
         """Forget what was compiled of a step that now reads something else."""
-        if self._read is not None and not self._read.unchanged(library=False):
-            self._compiled.clear()
-            self._prepared.clear()
-            self._read = self._model = self._refused = None
-            self._asked = 0
+        read = self._read
+        if read is None or read.unchanged(library=False):
+            return
+        with self._lock:
+            if self._read is read:  # and no other thread has looked meanwhile
+                self._compiled, self._prepared = {}, {}
+                self._read = self._model = self._refused = None
+                self._asked = 0
 
     def _again(self, key: Hashable) -> _Built | None:
         """The program of the model with a table of other numbers, None where that cannot be."""

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from .contents import Contents, version
+from .locks import Mutex
 from .program import Program
 from .trace.step import Step
 
@@ -53,6 +54,7 @@ class SharedPrograms:
 
     def __init__(self, name: str, most: int = 64) -> None:
         self._name, self._most, self._warned = name, most, False
+        self._lock = Mutex()
         self._models: dict[Hashable, _KeptModel] = {}
         self._latest: dict[Hashable, tuple[Program, Contents | None, tuple[Any, ...]]] = {}
 
@@ -94,7 +96,14 @@ class SharedPrograms:
         if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
             return Program(step, name=self._name, compile=False)
         versions = [*map(version, tensors)]
-        held = self._models.pop(read.key, None)
+        with self._lock:
+            return self._found(step, read, versions, copies, owners)
+
+    def _found(
+        self, step: Step, read: Contents, versions: list[int], copies: int, owners: tuple[Any, ...]
+    ) -> Program:
+        """Return the program of what a step reads: the kept one, one that follows from it, or a new one."""
+        tensors, held = read.tensors, self._models.pop(read.key, None)
         if held is None or read.replaced(held.methods):
             new, signature = Program(step, name=self._name, copies=copies), read.signature()
             new.described(signature, tensors)

@@ -92,7 +92,7 @@ class CompiledFilter:
         self._run, self.reference = call, ctypes.addressof(self._streams)
         # the same function, called without giving Python's lock away
         address = ctypes.cast(call, ctypes.c_void_p).value  # type: ignore[arg-type]
-        self.holding = ctypes.PYFUNCTYPE(ctypes.c_int, ctypes.c_char_p)(address)
+        self.holding = ctypes.PYFUNCTYPE(ctypes.c_int, ctypes.c_char_p)(address or 0)
         self._shape = (streams, state.outputs)
         self.short = streams * state.count**2 <= _SHORT
 

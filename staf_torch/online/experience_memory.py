@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
 
 from ..approximation.basis import StaFBasis
+from ..lanes.locks import ReadWriteLock
 from ..numerics.checks import hold, integer, positive_real, trailing
 
 _DRIFT = 4.0  # usual distances between a model and the average of those before it
@@ -28,6 +31,8 @@ class ExperienceMemory(nn.Module):
     away: models do not travel with the state. Elsewhere, once the memory is full, a new model takes the
     place of the most redundant one: of the closest pair of states the one whose second neighbour is closer
     too, so that no gap opens while another one is twice covered.
+
+    Threads may share one: any number of them ask at once, and a model is stored while nobody does.
 
     Every batch entry has a memory of its own. To share one among trajectories, leave ``batch_shape``
     empty and add their models one after the other.
@@ -75,6 +80,7 @@ class ExperienceMemory(nn.Module):
         self.reach = positive_real("ExperienceMemory", "reach", reach)
         self.spacing = positive_real("ExperienceMemory", "spacing", spacing)
         self.visits = integer("ExperienceMemory", "visits", visits, least=1)
+        self._lock = ReadWriteLock()
         like = basis.centers.directions
         self.states = hold(self, "states", like.new_zeros(*batch_shape, capacity, basis.dim))
         self.coefficients = hold(self, "coefficients", like.new_zeros(*batch_shape, capacity, basis.count))
@@ -106,6 +112,10 @@ class ExperienceMemory(nn.Module):
                     f"`ExperienceMemory.add({name}=...)` must have the shape {(*batch, last)}; "
                     f"got {tuple(value.shape)}."
                 )
+        self._lock.write(self._add, x, coefficients)
+        return self
+
+    def _add(self, x: Tensor, coefficients: Tensor) -> None:
         with torch.no_grad():
             fine = torch.isfinite(x).all(-1) & torch.isfinite(coefficients).all(-1)
             here = torch.where(fine.unsqueeze(-1), x, 0.0).to(self.states)
@@ -120,10 +130,12 @@ class ExperienceMemory(nn.Module):
             another = (fine & (slot != self.latest)).unsqueeze(-1)
             self.origin.copy_(torch.where(another, x.to(self.states), self.origin))
             self.latest.copy_(torch.where(fine, slot, self.latest))
-        return self
 
     def query(self, y: Tensor) -> Tensor:
         """V^(y): (..., P, n) -> (..., P); NaN where no stored model reaches."""
+        return self._asked(self._query, y)
+
+    def _query(self, y: Tensor) -> Tensor:
         weights = self._weights(y)
         return (weights * self._local(y)).sum(-1) / weights.sum(-1)  # 0 / 0 where none reaches
 
@@ -131,12 +143,11 @@ class ExperienceMemory(nn.Module):
 
     def gradient(self, y: Tensor) -> Tensor:
         """Gradient of the blend at y: (..., P, n) -> (..., P, n)."""
-        found: Tensor = torch.func.grad(lambda point: self.query(point).sum())(y)
-        return found
+        return self._asked(torch.func.grad(lambda point: self._query(point).sum()), y)
 
     def covered(self, y: Tensor) -> Tensor:
         """Return whether a stored model reaches y: (..., P, n) -> (..., P) bool."""
-        return (self._weights(y) > 0).any(-1)
+        return (self._asked(self._weights, y) > 0).any(-1)
 
     def start(self, x: Tensor) -> Tensor:
         """Coefficients in ``basis.local(x)`` to start from at the states x.
@@ -151,16 +162,23 @@ class ExperienceMemory(nn.Module):
             (..., M) or (..., P, M).
         """
         trailing("ExperienceMemory.start", "x", x, dims=1, last=self.basis.dim)
+        return self._asked(self._start, x)
+
+    def _start(self, x: Tensor) -> Tensor:
         if x.dim() == self.stored.dim():
-            return self.start(x.unsqueeze(-2)).squeeze(-2)
+            return self._start(x.unsqueeze(-2)).squeeze(-2)
         several = (x.shape[-2], self.basis.count)
         centers = self.basis.centers(x).flatten(-3, -2)  # (..., P M, n)
         nearest = self._relative(x).argmin(-1, keepdim=True).repeat_interleave(self.basis.count, dim=-2)
         single = self._local(centers).gather(-1, nearest).squeeze(-1)
-        blend = self.query(centers)
+        blend = self._query(centers)
         values = torch.where(torch.isnan(blend), single, blend).unflatten(-1, several)
         found = self.basis.local(x).fit(values)
         return torch.where(self.covered(x).unsqueeze(-1), found, torch.nan)
+
+    def _asked(self, function: Callable[[Tensor], Tensor], y: Tensor) -> Tensor:
+        """Return function(y) while no model is stored."""
+        return function(y) if torch.compiler.is_compiling() else self._lock.read(function, y)
 
     def _relative(self, y: Tensor) -> Tensor:
         """t_j, (..., P, n) -> (..., P, N); inf where nothing is stored."""
