@@ -114,14 +114,14 @@ class StaFBasis(nn.Module):
         return self.centers.dim
 
     def forward(self, y: Tensor, x: Tensor) -> Tensor:
-        """sigma(y; x): (..., P, n), (..., n) -> (..., P, M).
+        """sigma(y; x): (..., P, n), (..., n) -> (..., P, M), of the dtype of its arguments.
 
         The first evaluation at y = x warns where sigma(x; x) is the same at every state: `check_own_value`.
         """
         trailing("StaFBasis", "y", y, dims=2, last=self.dim)
         if self._unseen and not torch.compiler.is_compiling() and _same(y, x):
             self.check_own_value(x, stacklevel=5)
-        sigma: Tensor = self.kernel(y, self.centers(x))
+        sigma: Tensor = self.kernel(y, self.centers(x)).to(torch.promote_types(y.dtype, x.dtype))
         return sigma
 
     def gram(self, x: Tensor) -> Tensor:

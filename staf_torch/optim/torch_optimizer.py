@@ -210,24 +210,25 @@ def _check_independent(names: list[str], parameters: list[Tensor], slopes: Seque
         generator = torch.Generator().manual_seed(0)
         v = torch.randn(parameter.shape, dtype=torch.float64, generator=generator).to(parameter)
         rows = torch.linspace(1, 2, v[..., 0].numel(), dtype=torch.float64).to(v).view_as(v[..., :1])
-        own = _curvature(slope, parameter, v)
+        products = _products(slope, parameters, v)
+        own = products[[p is parameter for p in parameters].index(True)]
         size, rounding = float(own.norm()), torch.finfo(v.dtype).eps ** 0.5
-        for other, its in zip(names, parameters, strict=True):
-            between = _curvature(slope, its, v).norm() if its is not parameter else v.new_zeros(())
-            if float(between) > rounding * size:
+        for other, its, product in zip(names, parameters, products, strict=True):
+            between = float(product.norm())
+            if its is not parameter and between > rounding * size:
                 raise ValueError(
                     f"`ChaseOptimizer(params=...)` must be independent of each other: the curvature of the "
-                    f"loss between {name} and {other} is {_times(float(between), size)} of {name} itself. "
+                    f"loss between {name} and {other} is {_times(between, size)} of {name} itself. "
                     "Make them one parameter, or leave one of them to another optimizer."
                 )
-        apart = (_curvature(slope, parameter, rows * v) - rows * own).norm(dim=-1)
+        apart = (_products(slope, [parameter], rows * v)[0] - rows * own).norm(dim=-1)
         whole = own.norm(dim=-1)
         coupled = apart > rounding * whole + torch.finfo(v.dtype).eps * whole.amax()
         if bool(coupled.any()):
             first = tuple(coupled.nonzero()[0].tolist())
             alone = torch.zeros_like(v)
             alone[first] = v[first]
-            found = _curvature(slope, parameter, alone).norm(dim=-1)
+            found = _products(slope, [parameter], alone)[0].norm(dim=-1)
             within = float(found[first])
             found[first] = 0
             second = tuple((found == found.max()).nonzero()[0].tolist())
@@ -243,8 +244,9 @@ def _times(size: float, other: float) -> str:
     return f"{size / other if other else torch.inf:.3g} times that"
 
 
-def _curvature(slope: Tensor, parameter: Tensor, direction: Tensor) -> Tensor:
-    """The product of the mixed second derivatives with a direction of the slope, in the parameter."""
+def _products(slope: Tensor, parameters: list[Tensor], direction: Tensor) -> list[Tensor]:
+    """The second derivatives of a loss, in a direction of one parameter's slope and in each parameter."""
     with torch.enable_grad():
-        (product,) = torch.autograd.grad(slope, parameter, direction, retain_graph=True, allow_unused=True)
-    return torch.zeros_like(parameter) if product is None else product.detach()
+        found = torch.autograd.grad(slope, parameters, direction, retain_graph=True, allow_unused=True)
+    given = zip(parameters, found, strict=True)
+    return [torch.zeros_like(p) if product is None else product.detach() for p, product in given]
