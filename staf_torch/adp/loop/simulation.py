@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from ...approximation.basis import StaFBasis
 from ...lanes import Program
 from ...lanes.compiled_methods import undecided, worth
 from ...lanes.loop_program import LoopProgram
@@ -195,6 +196,8 @@ def simulate(
     }
     loop = ClosedLoop(controller, system, cost, dt=dt, **more)  # type: ignore[arg-type]
     loop.to(x0.device)
+    for basis in (part for part in loop.modules() if isinstance(part, StaFBasis)):
+        basis.check_learned()
     if isinstance(controller, Feedback) and x0.device.type != "cpu":
         controller.check(x0)
     if compile is True and not system.traceable:
