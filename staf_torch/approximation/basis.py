@@ -186,8 +186,8 @@ class StaFBasis(nn.Module):
         warnings.warn(
             f"StaFBasis of {kernel} has the same values at every state that it stands around (largest "
             f"relative change of basis(x, x) between states: {change:.2g}): V^(x) = basis(x, x) @ w is a "
-            f"constant, whatever w is. Take `AnchoredKernel({kernel}(...))`, `ExponentialKernel()`, "
-            f"{moving}or weights that depend on x.",
+            f"constant unless w depends on x. Take `AnchoredKernel({kernel}(...))`, `ExponentialKernel()`, "
+            f"{moving}or such weights.",
             stacklevel=stacklevel,
         )
         return True

@@ -111,7 +111,7 @@ def by_hand(kind: str, name: str, row_number: int) -> dict[str, Tensor]:
     path, past = [first], None
     for k in range(len(x)):
         gram, values = basis.gram(x[k]), basis.values(x[k], Paper())
-        ideal, row = torch.linalg.solve(gram, values), basis(x[k][None], x[k])[0]
+        ideal, row = torch.linalg.solve(gram, values), basis.kernel(x[k][None], basis.centers(x[k]))[0]
         before = after = predicted(basis, name, k, x, path)
         for _ in range(ITERATIONS):
             g = values - gram @ after
