@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 from . import _conf
 from ._version import __version__ as __version__
+from .results import pictures as _pictures
 
 if TYPE_CHECKING:  # for type checkers and editors; the tables below say it again for Python
     from . import adp as adp
@@ -113,3 +114,4 @@ else:
 
 
 _conf.install()
+_pictures.drawn_by(lambda: importlib.import_module(f"{__name__}.figures.loop").draw_loop)

@@ -15,14 +15,14 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from ..adp import ActorCritic, Controller, Cost, Gains, LoopResult, SafetyFilter, Supervised, simulate
+from ..adp.loop.picture import picture
 from ..adp.loop.setup import AdpProblem
 from ..adp.planning.shooting.reference_optimum import LoopOptimum, compare
 from ..adp.problem.held_linear import HeldLoop
 from ..figures.closed_loop import AdpHistory, draw_adp
-from ..figures.style import images
+from ..figures.style import draws, images
 from ..lanes.tree import flatten, unflatten
 from ..metrics.closed_loop import adp_metrics
-from ..numerics.angles import wrap
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.adp import adp_problem
@@ -48,7 +48,6 @@ class LoopSolution:
     dt: float  # s
     steps: int
     metrics: Metrics  # what `metrics.json` will hold
-    periodic: tuple[int, ...] = ()  # coordinates that are angles
 
 
 class Regulation(BatchedExperiment[LoopSolution]):
@@ -85,7 +84,7 @@ class Regulation(BatchedExperiment[LoopSolution]):
             write_history(out, solution.result.time, recorded(solution.result))
         log_diverged(_log, solution.result.state[:, 0], solution.result.frozen_at)
         write_animation(cfg, out, "closed_loop", lambda: loop_scene(adp_problem(cfg), solution.result))
-        if cfg.figures:
+        if draws(cfg.figures):
             out.figure(cfg.task, images(draw_adp(_drawn(solution))))
         _summarise(solution)
         _explain(cfg, solution)
@@ -130,8 +129,7 @@ def _solved(cfg: DictConfig, problem: AdpProblem, result: LoopResult) -> LoopSol
     own = make_metrics(cfg.get("metric"))
     metrics |= {metric.name: metric.worst(result, problem) for metric in own}
     method = f"{type(problem.system).__name__} with {problem.controller.label}"
-    periodic = problem.system.periodic
-    return LoopSolution(result, optimum, method, problem.dt, problem.steps, metrics, periodic)
+    return LoopSolution(result, optimum, method, problem.dt, problem.steps, metrics)
 
 
 def held_radius(problem: AdpProblem, result: LoopResult) -> float | None:
@@ -309,9 +307,8 @@ def _drawn(solution: LoopSolution) -> AdpHistory:
     errors = {"control_error": optimum.control_error, "value_error": optimum.value_error}
     first: dict[str, Any] = {name: rows[0].cpu().numpy() for name, rows in recorded(result).items()}
     first |= {name: None if rows is None else rows[0].cpu().numpy() for name, rows in errors.items()}
-    state = wrap(result.state[0], solution.periodic).cpu()
-    for k in solution.periodic:  # no line where an angle jumps by a turn
-        state[1:, k][state[:, k].diff().abs() > math.pi] = torch.nan
-    first["state"] = state.numpy()
+    shown = picture(result, [0], lqr=False)
+    names = ("state_units", "input_units", "low", "high")
+    first |= {"state": shown.state[0], **{name: getattr(shown, name) for name in names}}
     best = None if optimum.cost is None else float(optimum.cost[0])
     return AdpHistory(time=result.time.numpy(), optimal_cost=best, **first)

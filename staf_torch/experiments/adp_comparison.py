@@ -16,6 +16,7 @@ from ..adp import Controller, Feedback, LoopResult, RolloutPolicy
 from ..adp.loop.setup import AdpProblem
 from ..adp.planning.shooting.reference_optimum import optimal_cost
 from ..figures.closed_loop import draw_comparison
+from ..figures.style import draws
 from ..metrics.closed_loop import comparison_row, regulated
 from ..numerics.checks import COMMAND_LINE, fail, positive_real, vector
 from ..results.progress import SHOWN, Progress
@@ -80,7 +81,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
         row = {"functions": functions, "points": points} | comparison_row(result, ratio, final)
         study.add(f"{label_key(name)}_", row, {"microseconds": 1e6 * seconds}, method=name)
         ratios[name] = torch.where(regulated(result, final), ratio, torch.inf).cpu().numpy()
-    drawing = (lambda: draw_comparison(ratios)) if cfg.figures else None
+    drawing = (lambda: draw_comparison(ratios)) if draws(cfg.figures) else None
     return study.write(RunDirectory(directory), drawing, "adp_comparison")
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from .. import adp
 from ..adp import ConcurrentLearning, Controller, IdentifyingTracker, LoopResult, QuadraticCost
 from ..figures.closed_loop import TrackingHistory, draw_tracking
-from ..figures.style import images
+from ..figures.style import draws, images
 from ..metrics.closed_loop import tracking_metrics
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
@@ -60,7 +60,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     if cfg.history:
         write_history(out, identified.time, recorded(identified) | {"parameters": parameters})
     write_animation(cfg, out, "tracking", lambda: tracking_scene(controllers["identified"], identified))
-    if cfg.figures:
+    if draws(cfg.figures):
         out.figure("adp_tracking", images(draw_tracking(_drawn(results, parameters, plant.theta))))
     return out.metrics(metrics)
 

@@ -14,7 +14,8 @@ from torch import Tensor
 from .. import adp
 from ..adp import LQR, AdaptiveLQR, Cost, IntegralWindows, LeastSquares, LoopResult, Measured, ParametricPlant
 from ..figures.closed_loop import FaultPicture, draw_faults
-from ..numerics.checks import COMMAND_LINE, choice, flag, integer, positive_real
+from ..figures.style import draws
+from ..numerics.checks import COMMAND_LINE, choice, integer, positive_real
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.chase import generator_of, plain
@@ -55,7 +56,7 @@ class FaultCase(NamedTuple):
 
 def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
     """Run every case with three policies and fill the run directory; `metrics.json` comes last."""
-    figures = flag(COMMAND_LINE, "figures", cfg.figures)
+    figures = draws(cfg.figures)
     rows = integer(COMMAND_LINE, "trajectories", cfg.trajectories, least=1)
     duration = positive_real(COMMAND_LINE, "duration", cfg.duration)
     generator = generator_of(cfg)

@@ -21,10 +21,11 @@ from torch import Tensor
 
 from ..approximation.basis import StaFBasis, Target
 from ..centers import StateFollowingCenters, probe_points, rings
+from ..figures.style import draws
 from ..figures.theory import ErrorPanel, draw_errors
 from ..kernels import ExponentialKernel, GaussianKernel, Kernel
 from ..local_basis import evaluate_scaled, newton_space
-from ..numerics.checks import COMMAND_LINE, fail, flag, integer, positive_real
+from ..numerics.checks import COMMAND_LINE, fail, integer, positive_real
 from ..results.files import grouped
 from ..results.progress import SHOWN, Progress
 from ..results.reader import Value
@@ -194,7 +195,7 @@ class FlatLimitErrors(NamedTuple):
 def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
     """Run what the settings describe and fill the run directory; `metrics.json` comes last."""
     problem = problem_of(cfg)
-    figures = flag(COMMAND_LINE, "figures", cfg.figures)
+    figures = draws(cfg.figures)
     samples = solve(problem, progress)
     out = RunDirectory(directory)
     drawing = (lambda: draw_errors(_panels(samples), rows=len(DTYPES))) if figures else None

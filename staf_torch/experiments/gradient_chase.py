@@ -15,12 +15,13 @@ import torch
 from omegaconf import DictConfig
 
 from ..figures.chase import ChaseHistory, draw_chase
-from ..figures.style import images
+from ..figures.style import draws, images
 from ..numerics.checks import COMMAND_LINE, flag
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.chase import ChaseProblem, Parts, chase_problem, warnings_to
 from ..settings.plain import PlainSettings, to_read
+from ..systems import Units
 from ..tables.columns import significant
 from .chase_batch import Outcome, simulate
 from .registry import BatchedExperiment, Metrics
@@ -63,6 +64,7 @@ class ChaseSolution:
     starts: np.ndarray  # initial states, (B, n)
     history: dict[str, np.ndarray] | None = None  # name -> (B, T, ...)
     warnings: tuple[str, ...] = ()
+    units: tuple[str, ...] = ()  # of the states
 
     @property
     def metrics(self) -> Metrics:
@@ -96,7 +98,8 @@ class GradientChase(BatchedExperiment[ChaseSolution]):
             (outcome,) = simulate([problem], [sink], [figures], advance)
             if writer is not None:
                 writer.close(time=_times(title))
-        return _finish(out, ChaseSolution(title, outcome, problem.initial_states.cpu().numpy()), cfg)
+        starts = problem.initial_states.cpu().numpy()
+        return _finish(out, ChaseSolution(title, outcome, starts, units=_units(problem)), cfg)
 
     def solve(self, cfgs: Sequence[DictConfig], progress: Progress) -> list[ChaseSolution | Exception]:
         """Solve several configurations of one group as one tensor batch."""
@@ -158,10 +161,10 @@ class _Ready:
 
     def solved(self, outcome: Outcome, common: Sequence[str]) -> ChaseSolution:
         """With what the whole batch was warned of."""
-        told = dict.fromkeys([*self.warnings, *common, *outcome.warnings])
         history = None if self.memory is None else self.memory.arrays
         starts = self.problem.initial_states.cpu().numpy()
-        return ChaseSolution(Title.of(self.problem), outcome, starts, history, tuple(told))
+        told, units = dict.fromkeys([*self.warnings, *common, *outcome.warnings]), _units(self.problem)
+        return ChaseSolution(Title.of(self.problem), outcome, starts, history, tuple(told), units)
 
 
 def _prepared(cfg: DictConfig | PlainSettings, parts: Parts) -> _Ready | Exception:
@@ -194,9 +197,14 @@ class _Memory:
 
 def _wanted(cfg: DictConfig | PlainSettings, problem: ChaseProblem) -> tuple[bool, bool]:
     """Return whether the first trajectory is drawn, at rest or in motion, and whether there is a history."""
-    drawn = flag(COMMAND_LINE, "figures", cfg.figures)
+    drawn = draws(cfg.figures)
     moving = animation_kind(cfg, problem.basis.dim) is not None
     return drawn or moving, flag(COMMAND_LINE, "history", cfg.history)
+
+
+def _units(problem: ChaseProblem) -> tuple[str, ...]:
+    units: Units = getattr(problem.system, "units", Units())  # of any module with the methods of a plant
+    return units.of_states(problem.initial_states.shape[-1])
 
 
 def _finish(out: RunDirectory, solved: ChaseSolution, cfg: DictConfig) -> Metrics:
@@ -205,8 +213,8 @@ def _finish(out: RunDirectory, solved: ChaseSolution, cfg: DictConfig) -> Metric
     diverged = torch.where(outcome.diverged_at < 0, torch.inf, outcome.diverged_at * solved.title.dt)
     log_diverged(_log, solved.starts, diverged, "; its weights are frozen from there on")
     write_animation(cfg, out, "chase", lambda: chase_scene(chase_problem(cfg), outcome.drawn))
-    if cfg.figures:
-        out.figure("gradient_chase", images(draw_chase(ChaseHistory(**outcome.drawn))))
+    if draws(cfg.figures):
+        out.figure("gradient_chase", images(draw_chase(ChaseHistory(**outcome.drawn, units=solved.units))))
     _summarise(solved.title, outcome.metrics)
     return out.metrics(solved.metrics)
 

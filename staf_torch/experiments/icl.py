@@ -13,7 +13,8 @@ from torch import Tensor
 
 from ..adp import ConcurrentTracker, Measured, ParametricPlant, QuadraticCost
 from ..figures.closed_loop import GainSets, draw_gain_sets
-from ..numerics.checks import COMMAND_LINE, fail, flag, integer, non_negative, positive_real, real, vector
+from ..figures.style import draws
+from ..numerics.checks import COMMAND_LINE, fail, integer, non_negative, positive_real, real, vector
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.chase import generator_of, plain, seed_of
@@ -47,7 +48,7 @@ class SourceRun(NamedTuple):
 
 def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
     """Run both sources with the same gains and noise and fill the run directory, `metrics.json` last."""
-    figures = flag(COMMAND_LINE, "figures", cfg.figures)
+    figures = draws(cfg.figures)
     settle = non_negative(COMMAND_LINE, "settle_time", cfg.settle_time)
     plant, gains = published(), _gains(cfg)
     if settle > positive_real(COMMAND_LINE, "duration", cfg.duration):

@@ -15,6 +15,7 @@ from omegaconf import DictConfig
 from .. import optim, theory
 from ..engine.predictors import Predictor, Secant, Tangent
 from ..figures.chase import ConvergenceCurve, draw_convergence
+from ..figures.style import draws
 from ..metrics.ball_error import StateErrorPass
 from ..numerics.checks import COMMAND_LINE, fail, integer, positive_real, vector
 from ..optim import UpdateLaw
@@ -143,7 +144,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     out = RunDirectory(directory)
     every = Table.of([{name: value for name, value in row.items() if name != "key"} for row in rows])
     out.text("laws.json", json.dumps(rows, indent=2, allow_nan=False) + "\n")
-    drawing = (lambda: draw_convergence(_lines(swept, steps))) if cfg.figures else None
+    drawing = (lambda: draw_convergence(_lines(swept, steps))) if draws(cfg.figures) else None
     about = f"t >= {problem.settle_time:g} s, dt = {problem.dt:g} s, {problem.basis.count} centers"
     heading = f"Worst over {about}:"
     report(out, _log, "laws", every, drawing, shown=Table.of(rows, _HEADINGS), heading=heading)

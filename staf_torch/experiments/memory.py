@@ -13,7 +13,8 @@ from torch import Tensor
 from ..centers import probe_points
 from ..engine import ChaseResult, chase
 from ..figures.chase import MemoryPicture, draw_memory
-from ..numerics.checks import COMMAND_LINE, fail, flag, integer, positive_real
+from ..figures.style import draws
+from ..numerics.checks import COMMAND_LINE, fail, integer, positive_real
 from ..online.experience_memory import ExperienceMemory
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
@@ -57,7 +58,7 @@ class Revisits(NamedTuple):
 def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
     """Run what the settings describe and fill the run directory; `metrics.json` comes last."""
     problem, settings = chase_problem(cfg), settings_of(cfg)
-    figures = flag(COMMAND_LINE, "figures", cfg.figures)
+    figures = draws(cfg.figures)
     first = round(problem.settle_time / problem.dt)
     if not 0 <= first < problem.steps:
         raise fail(COMMAND_LINE, "settle_time", "must lie within the duration", problem.settle_time)

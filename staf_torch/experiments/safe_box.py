@@ -13,6 +13,7 @@ from ..adp import LQR, BoxFilter, Cost, DirectShooting, Feedback, LoopResult, Qu
 from ..adp.loop.setup import OptimumSettings
 from ..adp.safety.safety_filter import walls
 from ..figures.closed_loop import BoxHistory, draw_box
+from ..figures.style import draws
 from ..metrics.safety import constraint_metrics
 from ..numerics.checks import COMMAND_LINE, fail, flag, integer, positive_real
 from ..results.progress import SHOWN, Progress
@@ -74,7 +75,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
         arrays |= {"running_cost": first.running_cost, "margin": margins["LQR of s"]}
         write_history(out, first.time, arrays)
     drawn = _drawn(box, compared, results, margins)
-    return study.write(out, (lambda: draw_box(drawn)) if cfg.figures else None)
+    return study.write(out, (lambda: draw_box(drawn)) if draws(cfg.figures) else None)
 
 
 def methods(cfg: DictConfig, box: Barrier, cost: Cost) -> dict[str, Method]:
@@ -180,4 +181,5 @@ def _drawn(
         barrier_state=of_s.state[0].cpu().numpy(),
         low=box.low.cpu().numpy(),
         high=box.high.cpu().numpy(),
+        units=box.plant.units.of_states(len(box.low)),
     )

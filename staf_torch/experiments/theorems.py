@@ -15,6 +15,7 @@ from torch import Tensor
 
 from .. import theory
 from ..centers import ball, cross_polytope, polygon, rings, simplex
+from ..figures.style import draws
 from ..figures.theory import Feasibility, LayoutCurve, draw_exponential_bound, draw_feasibility, draw_layouts
 from ..kernels import ExponentialKernel
 from ..numerics.checks import COMMAND_LINE, fail, integer, positive_real
@@ -67,7 +68,7 @@ def layouts(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Met
     found = layout_curves(problem, radii, progress)
     out = RunDirectory(directory)
     rows = [_layout_row(curve, radii) for curve in found]
-    drawing = (lambda: draw_layouts(found, problem.radius, np.array(radii))) if cfg.figures else None
+    drawing = (lambda: draw_layouts(found, problem.radius, np.array(radii))) if draws(cfg.figures) else None
     heading = f"sup |V - V^| on the ball, r = {problem.radius:g}, ideal weights, and its slope in r:"
     shown = Table.of(rows, _LAYOUTS)
     report(out, _log, "layouts", Table.of(rows), drawing, shown=shown, heading=heading)
@@ -149,7 +150,7 @@ def feasibility(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) ->
             _log,
             "feasibility",
             Table.of(rows),
-            (lambda: draw_feasibility(picture)) if cfg.figures else None,
+            (lambda: draw_feasibility(picture)) if draws(cfg.figures) else None,
         ),
         shown=Table.of(wide, headings),
         heading="Smallest M with sup |V - V^| <= eps on the ball along the trajectory, ideal weights:",
@@ -212,7 +213,7 @@ def exponential_bound(cfg: DictConfig, directory: Path, progress: Progress = SHO
     found = bounds(cfg, progress)
     rows = [{"radius": radius, "epsilon": epsilon, **row} for (radius, epsilon), row in found.items()]
     out = RunDirectory(directory)
-    drawing = (lambda: draw_exponential_bound(found)) if cfg.figures else None
+    drawing = (lambda: draw_exponential_bound(found)) if draws(cfg.figures) else None
     report(out, _log, "exponential_bound", Table.of(rows, _BOUNDS), drawing)
     return out.metrics(
         {f"r{r:g}.eps{e:g}.{name}": value for (r, e), row in found.items() for name, value in row.items()}

@@ -7,13 +7,15 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from .style import WIDTH, colour, curves, dash, legend_above, letter, marker, named, page, positive, ticks
+from .loop import by_unit
+from .style import against_time, colour, dash, decades, legend, letter, marker, named, panels, positive, ticks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_DECADES = 1e-6  # of its largest value a log axis shows at most
+_DECADES = 6  # below its largest value, on the axis of errors: they dip to rounding where they change sign
+_NAMED = 6  # weights that are told apart in a legend
 
 
 class ChaseHistory(NamedTuple):
@@ -27,6 +29,7 @@ class ChaseHistory(NamedTuple):
     weights: np.ndarray  # (T, M)
     ideal_weights: np.ndarray  # (T, M)
     excess: np.ndarray  # (T,)
+    units: tuple[str, ...] = ()  # of the states, "" for none
 
 
 class ConvergenceCurve(NamedTuple):
@@ -51,81 +54,76 @@ class MemoryPicture(NamedTuple):
 
 
 def draw_chase(history: ChaseHistory) -> Figure:
-    """The four panels of the paper's simulation: state, V against V^, weights, error and excess."""
-    with page(WIDTH, 5.4) as figure:
-        grid = figure.subplots(2, 2, sharex=True)
-        for axes, panel in zip(grid.flat, (_states, _values, _weights, _errors), strict=True):
+    """The four panels of the paper's simulation: state, V against V^, weights, error and excess.
+
+    States of several units have a panel each unit.
+    """
+    states = by_unit("state $x$", "x", history.units or ("",) * history.state.shape[1])
+    with panels(len(states) + 3) as (figure, grid):
+        for axes, (name, entries) in zip(grid, states, strict=False):
+            for k, i in enumerate(entries):
+                look = {"linestyle": dash(k), "color": colour(k), "label": f"$x_{{{i + 1}}}$"}
+                axes.plot(history.time, history.state[:, i], **look)
+            axes.set_ylabel(name)
+            if len(entries) > 1:
+                legend(axes)
+        for axes, panel in zip(grid[len(states) :], (_values, _weights, _errors), strict=True):
             panel(axes, history)
-            axes.margins(x=0)
-        letter(grid.flat)
-        for axes in grid[1]:
-            axes.set_xlabel("time (s)")
+            legend(axes)
+        letter(grid)
+        against_time(grid, history.time)
     return figure
 
 
-def _states(axes: Axes, history: ChaseHistory) -> None:
-    curves(axes, history.time, history.state, "$x_{%d}$")
-    axes.set_ylabel("state $x$")
-    legend_above(axes, history.state.shape[1])
-
-
 def _values(axes: Axes, history: ChaseHistory) -> None:
-    axes.plot(history.time, history.value, color="0.6", linewidth=3.0, label="$V(x)$")
+    axes.plot(history.time, history.value, color="0.7", linewidth=3.0, label="$V(x)$")
     axes.plot(history.time, history.estimate, "--", color=colour(0), label=r"$\hat V(x)$")
     axes.set_ylabel("value")
-    legend_above(axes, 2)
 
 
 def _weights(axes: Axes, history: ChaseHistory) -> None:
     count = history.weights.shape[1]
     for i in range(count):
-        axes.plot(history.time, history.weights[:, i], color=colour(i), label=f"$a_{{{i + 1}}}$")
-        axes.plot(history.time, history.ideal_weights[:, i], ":", color=colour(i))
-    axes.plot([], [], ":", color="0.3", label="ideal")
+        label = f"$a_{{{i + 1}}}$" if count <= _NAMED else None if i else "weights $a$"
+        axes.plot(history.time, history.weights[:, i], linestyle=dash(i), color=colour(i), label=label)
+    for i in range(count):
+        ideal = history.ideal_weights[:, i]
+        axes.plot(history.time, ideal, ":", color="0.2", linewidth=0.9, label=None if i else "ideal $w$")
     axes.set_ylabel("weights")
-    if count <= 6:
-        legend_above(axes, count + 1)
-    else:
-        axes.legend(handles=axes.get_lines()[-1:], loc="lower right", bbox_to_anchor=(1.0, 1.0))
 
 
 def _errors(axes: Axes, history: ChaseHistory) -> None:
     error = np.abs(history.value - history.estimate)
     floor = np.abs(history.value - history.ideal_estimate)
     axes.semilogy(history.time, positive(error), color=colour(0), label=r"$|V - \hat V|$")
-    axes.semilogy(history.time, positive(floor), "--", color="0.5", label="ideal weights (floor)")
+    axes.semilogy(history.time, positive(floor), "--", color="0.4", label="ideal weights")
     excess = positive(history.excess)
-    axes.semilogy(history.time, excess, "-.", color=colour(1), label="excess $F(a) - F(w)$")
-    # Each curve dips to rounding error where it changes sign; those spikes would take up the panel.
-    top = np.nanmax([np.nanmax(curve) for curve in (error, floor, history.excess)])
-    axes.set_ylim(bottom=max(axes.get_ylim()[0], _DECADES * top))
-    axes.set_ylabel("error at $x$; excess")
-    legend_above(axes, 2)
+    axes.semilogy(history.time, excess, "-.", color=colour(1), label="excess")
+    decades(axes, _DECADES)
+    axes.set_ylabel("error at $x$, excess")
 
 
 def draw_convergence(found: Sequence[ConvergenceCurve]) -> Figure:
     """Excess before the correction against the step, both logarithmic, with the slopes in the legend."""
-    with page(WIDTH, 3.6) as figure:
-        axes = figure.subplots()
-        for i, curve in enumerate(found):
-            slope = "-" if curve.slope is None else f"{curve.slope:.1f}"
-            (line,) = axes.loglog(curve.step, positive(curve.excess), dash(i), marker=marker(i), markersize=4)
-            line.set(color=colour(i), label=f"{curve.label}: {slope}")
+    slopes = ("-" if curve.slope is None else f"{curve.slope:.1f}" for curve in found)
+    labels = [f"{curve.label}: {slope}" for curve, slope in zip(found, slopes, strict=True)]
+    with panels(1, 2, high=3.0, spare=labels) as (figure, (axes,)):
+        for i, (curve, label) in enumerate(zip(found, labels, strict=True)):
+            (line,) = axes.loglog(curve.step, positive(curve.excess), linestyle=dash(i), marker=marker(i))
+            line.set(markersize=4, color=colour(i), label=label)
         ticks(axes, "x", np.unique(np.concatenate([curve.step for curve in found])))
         axes.minorticks_off()
-        axes.set_xlabel("step $\\Delta t$ (s)")
-        axes.set_ylabel("ultimate excess before the correction")
-        axes.legend(title="law, iterations, predictor: slope", loc="center left", bbox_to_anchor=(1.0, 0.5))
+        axes.set_xlabel("time step $\\Delta t$ (s)")
+        axes.set_ylabel("largest excess before the correction")
+        legend(axes, handles=axes.get_lines(), title="law, iterations, predictor: slope")
     return figure
 
 
 def draw_memory(picture: MemoryPicture) -> Figure:
     """Draw the states of stored models, the error over the visited region, the excess after a revisit."""
-    with page(WIDTH, 3.1) as figure:
-        grid = figure.subplots(1, 3)
+    with panels(3, 3, high=2.3) as (figure, grid):
         for axes, panel in zip(grid, (_map, _region, _revisits), strict=True):
             panel(axes, picture)
-            legend_above(axes, 1)
         letter(grid)
     return figure
 
@@ -150,8 +148,7 @@ def _map(axes: Axes, picture: MemoryPicture) -> None:
     )
     axes.add_collection(balls)
     axes.plot(points[:, 0], points[:, 1], ".", color=colour(0), markersize=3, label="stored model")
-    (ball,) = axes.plot([], [], "o", color=colour(0), label="ball of its centers")
-    ball.set(markerfacecolor="none", markersize=8)
+    legend(axes)
     axes.margins(0.12)
     axes.set_xlabel("$x_1$")
     axes.set_ylabel(f"$x_{second + 1}$")
@@ -160,7 +157,8 @@ def _map(axes: Axes, picture: MemoryPicture) -> None:
 
 def _region(axes: Axes, picture: MemoryPicture) -> None:
     named(axes, picture.time, picture.errors, log=True)
-    axes.set_xlabel("time at which the ball was visited (s)")
+    legend(axes)
+    axes.set_xlabel("time of the visit (s)")
     axes.set_ylabel(r"$\max\,|V - \hat V|$ on the ball")
     axes.margins(x=0)
 
@@ -171,4 +169,5 @@ def _revisits(axes: Axes, picture: MemoryPicture) -> None:
     axes.set_xscale("log")
     axes.axhline(picture.settled, color="0.2", linestyle=":", linewidth=0.8, label="settled chase")
     axes.set_xlabel("steps after the revisit")
-    axes.set_ylabel("largest excess $F(a) - F(w)$")
+    axes.set_ylabel("largest excess")
+    legend(axes)

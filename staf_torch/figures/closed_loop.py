@@ -7,29 +7,30 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from .loop import bounds, by_unit, with_unit
 from .style import (
-    WIDTH,
     against_time,
     colour,
     curves,
     dash,
+    decades,
     estimates,
-    legend_above,
-    legend_of_all,
+    legend,
     letter,
     marker,
     named,
-    page,
+    panels,
     positive,
     shares,
-    subplots,
 )
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
 _CRITIC = (r"critic $\hat W_c$", r"$\hat W_{c,%d}$")  # of the axis, of a line
+_NAMED = 6  # curves of a panel that a legend tells apart
 _MARKED = 200  # times at most that are drawn with a marker each
 _LEAST_EXCESS, _MOST_EXCESS = 1e-4, 1e2  # of the cost over the optimum, in the comparison
 
@@ -46,6 +47,10 @@ class AdpHistory(NamedTuple):
     control_error: np.ndarray | None  # (T,) |u - u*|
     value_error: np.ndarray | None  # (T,) |V - V^|
     optimal_cost: float | None  # V*(x(0))
+    state_units: tuple[str, ...] = ()  # "" for none
+    input_units: tuple[str, ...] = ()
+    low: np.ndarray = np.empty(0)  # (m,) of the inputs, -inf for none
+    high: np.ndarray = np.empty(0)
 
 
 class TrackingHistory(NamedTuple):
@@ -60,57 +65,75 @@ class TrackingHistory(NamedTuple):
 
 
 def draw_adp(history: AdpHistory) -> Figure:
-    """State, actor weights, critic weights, |u - u*|, |V - V^| and the running cost.
+    """State, actor weights, critic weights, |u - u*|, |V - V^| and the running cost; a panel a unit.
 
     Without weights the control takes their place; without a known optimum the errors are left out.
     """
-    lines = {"state $x$": (history.state, "$x_{%d}$")}
-    if history.actor_weights.shape[1]:
-        lines[r"actor $\hat W_a$"] = history.actor_weights, r"$\hat W_{a,%d}$"
-        lines[_CRITIC[0]] = history.critic_weights, _CRITIC[1]
+    n, m = history.state.shape[1], history.control.shape[1]
+    lines = _grouped("state $x$", "x", history.state_units or ("",) * n, history.state)
+    learned = bool(history.actor_weights.shape[1])
+    if learned:
+        for name, label, values in (
+            (r"actor $\hat W_a$", r"$\hat W_{a,%d}$", history.actor_weights),
+            (*_CRITIC, history.critic_weights),
+        ):
+            lines.append((name, values, [label % (i + 1) for i in range(values.shape[1])]))
     else:
-        lines["control $u$"] = history.control, "$u_{%d}$"
+        inputs = by_unit("control $u$", "u", history.input_units or ("",) * m)
+        lines += _grouped("control $u$", "u", history.input_units or ("",) * m, history.control)
     errors = {r"$|u - u^*|$": history.control_error, r"$|V^* - \hat V|$": history.value_error}
     known = {name: error for name, error in errors.items() if error is not None}
-    count = len(lines) + len(known) + 1
-    with page(WIDTH, 2.1 * -(-count // 2)) as figure:
-        grid = subplots(figure, count, 2)
-        left = iter(grid)
-        for name, (values, label) in lines.items():
-            _lines(next(left), history.time, values, name, label)
-        for name, error in known.items():
-            _logarithmic(next(left), history.time, error, name)
-        _cost(next(left), history)
-        letter(grid)
+    with panels(len(lines) + len(known) + 1) as (figure, grid):
+        titles = [""] * len(grid)
+        for axes, each in zip(grid, lines, strict=False):
+            _lines(axes, history.time, *each)
+        if not learned and len(history.low):
+            first = len(lines) - len(inputs)
+            for k, (_, entries) in enumerate(inputs, first):
+                titles[k] = bounds(grid[k], history.low[entries], history.high[entries])
+        for axes in grid[: len(lines)]:
+            if len(axes.get_legend_handles_labels()[0]) > 1:
+                legend(axes)
+        for axes, (name, error) in zip(grid[len(lines) :], known.items(), strict=False):
+            _logarithmic(axes, history.time, error, name)
+        _cost(grid[-1], history)
+        letter(grid, *titles)
         against_time(grid, history.time)
     return figure
 
 
-def _lines(axes: Axes, time: np.ndarray, values: np.ndarray, name: str, label: str) -> None:
-    count = values.shape[1]
-    curves(axes, time, values, label)
+def _grouped(
+    whole: str, letter: str, units: tuple[str, ...], values: np.ndarray
+) -> list[tuple[str, np.ndarray, list[str]]]:
+    """Name of an axis, its curves (T, k), and a name for each."""
+    return [
+        (name, values[:, entries], [f"${letter}_{{{i + 1}}}$" for i in entries])
+        for name, entries in by_unit(whole, letter, units)
+    ]
+
+
+def _lines(axes: Axes, time: np.ndarray, name: str, values: np.ndarray, labels: Sequence[str]) -> None:
+    for i, (column, label) in enumerate(zip(values.T, labels, strict=True)):
+        shown = label if len(labels) <= _NAMED else None
+        axes.plot(time, column, linestyle=dash(i), color=colour(i), label=shown)
     axes.set_ylabel(name)
-    if count <= 5:
-        legend_above(axes, count)
-    else:  # two short rows, beside the letter of the panel and not over it
-        tight = {"borderaxespad": 0.2, "handlelength": 1.3, "columnspacing": 0.8, "handletextpad": 0.4}
-        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=-(-count // 2), **tight)
 
 
 def _logarithmic(axes: Axes, time: np.ndarray, values: np.ndarray, name: str) -> None:
     known = np.isfinite(values)  # an optimum found by shooting is known at some of the times alone
     marked = "" if known.sum() > _MARKED else "."
     axes.semilogy(time[known], positive(values[known]), color=colour(0), marker=marked, markersize=3)
+    decades(axes)
     axes.set_ylabel(name)
 
 
 def _cost(axes: Axes, history: AdpHistory) -> None:
     axes.plot(history.time, history.running_cost, color=colour(0), label="so far")
     if history.optimal_cost is not None:
-        axes.axhline(history.optimal_cost, color="0.5", linestyle="--", label="optimal, $V^*(x(0))$")
-    axes.set_ylim(bottom=0)
+        axes.axhline(history.optimal_cost, color="0.4", linestyle="--", label="optimal, $V^*(x(0))$")
+        legend(axes)
+    axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
     axes.set_ylabel("cost")
-    legend_above(axes, 2)
 
 
 def draw_comparison(ratios: Mapping[str, np.ndarray]) -> Figure:
@@ -119,33 +142,37 @@ def draw_comparison(ratios: Mapping[str, np.ndarray]) -> Figure:
     Args:
         ratios: method to cost / optimal cost, (B,); inf for trajectories that were not regulated.
     """
-    with page(5.4, 3.2) as figure:
-        axes = figure.subplots()
-        for i, (name, values) in enumerate(ratios.items()):
-            excess = np.sort(np.maximum(values - 1, _LEAST_EXCESS))
-            share = np.arange(1, len(excess) + 1) / len(excess)
-            finite = np.isfinite(excess)
-            line = dash(i // 7)  # seven colours, then dashed
-            axes.step(excess[finite], share[finite], line, where="post", color=colour(i), label=name)
+    excess = {name: np.sort(np.maximum(values - 1, _LEAST_EXCESS)) for name, values in ratios.items()}
+    known = np.concatenate([values[np.isfinite(values)] for values in excess.values()])
+    with panels(1, 2, high=2.8, spare=list(ratios)) as (figure, (axes,)):
+        for i, (name, values) in enumerate(excess.items()):
+            share = np.arange(1, len(values) + 1) / len(values)
+            finite = np.isfinite(values)
+            if finite.any():
+                look = {"linestyle": dash(i // 7 + i), "color": colour(i), "label": name}
+                axes.step(values[finite], share[finite], where="post", **look)
         axes.set_xscale("log")
-        axes.set_xlim(_LEAST_EXCESS, _MOST_EXCESS)
+        axes.set_xlim(known.min(), min(2 * known.max(), _MOST_EXCESS)) if len(known) else None
         axes.set_ylim(0, 1.02)
         axes.set_xlabel("excess cost $J/J^* - 1$")
         axes.set_ylabel("share of initial states regulated")
-        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+        legend(axes, handles=axes.get_lines())
     return figure
 
 
 def draw_tracking(history: TrackingHistory) -> Figure:
     """State against desired state, |e| of every variant, theta^ against theta, critic weights."""
-    with page(WIDTH, 4.4) as figure:
-        grid = list(figure.subplots(2, 2).flat)
+    with panels(4) as (figure, grid):
         _followed(grid[0], history)
         named(grid[1], history.time, history.errors, log=True)
         grid[1].set_ylabel("$|x - x_d|$")
-        legend_above(grid[1], 3)
-        _parameters(grid[2], history)
-        _lines(grid[3], history.time, history.critic_weights, *_CRITIC)
+        estimates(grid[2], history.time, history.parameters, history.truth)
+        grid[2].set_ylabel(r"drift parameters $\hat\theta$")
+        name, label = _CRITIC
+        labels = [label % (i + 1) for i in range(history.critic_weights.shape[1])]
+        _lines(grid[3], history.time, name, history.critic_weights, labels)
+        for axes in grid:
+            legend(axes)
         letter(grid)
         against_time(grid, history.time)
     return figure
@@ -154,18 +181,10 @@ def draw_tracking(history: TrackingHistory) -> Figure:
 def _followed(axes: Axes, history: TrackingHistory) -> None:
     for i in range(2):
         desired = history.state[:, 2 + i]
-        axes.plot(history.time, history.state[:, i] + desired, color=colour(i), label=f"$x_{i + 1}$")
+        look = {"linestyle": dash(i), "color": colour(i), "label": f"$x_{i + 1}$"}
+        axes.plot(history.time, history.state[:, i] + desired, **look)
         axes.plot(history.time, desired, ":", color="0.2", label="desired" if i else None)
     axes.set_ylabel("state")
-    legend_above(axes, 3)
-
-
-def _parameters(axes: Axes, history: TrackingHistory) -> None:
-    estimates(axes, history.time, history.parameters, history.truth)
-    axes.plot([], [], color="0.3", label=r"$\hat\theta$, one colour an entry")
-    axes.plot([], [], ":", color="0.2", label=r"$\theta$")
-    axes.set_ylabel("drift parameters")
-    legend_above(axes, 2)
 
 
 _EARLY = 2.0  # s: what happens to the estimates later is not seen at the scale of the truth
@@ -182,22 +201,23 @@ class FaultPicture(NamedTuple):
 
 
 def draw_faults(cases: Mapping[str, FaultPicture]) -> Figure:
-    """A column a case: |x| under every policy above, the parameters below, shaded while uncertain."""
-    with page(WIDTH, 4.2) as figure:
-        grid = figure.subplots(2, len(cases), squeeze=False)
-        letter([*grid[0], *grid[1]], *cases, *[""] * len(cases))
-        for k, case in enumerate(cases.values()):
-            above, below = grid[0, k], grid[1, k]
-            named(above, case.time, case.norms, log=True)
-            estimates(below, case.time, case.parameters, case.truth)
+    """A row a case: |x| under every policy, and the parameters at first, shaded while they are uncertain."""
+    with panels(2 * len(cases)) as (figure, grid):
+        titles = []
+        for (name, case), norms, parameters in zip(cases.items(), grid[::2], grid[1::2], strict=True):
+            named(norms, case.time, case.norms, log=True)
+            norms.set_ylabel("$|x|$")
+            estimates(parameters, case.time, case.parameters, case.truth)
             low, high = _frame(case)
-            below.set_ylim(low, high)
-            below.fill_between(case.time, low, high, where=~case.certain, color="0.85", linewidth=0, zorder=0)
-            against_time((above, below), case.time)
-            below.set_xlim(case.time[0], min(case.time[-1], _EARLY))
-        grid[0, 0].set_ylabel("$|x|$")
-        grid[1, 0].set_ylabel(r"$\hat\theta$ and $\theta$ (dotted)")
-        grid[0, 0].legend(loc="lower left")
+            grey = {"color": "0.88", "linewidth": 0, "zorder": 0, "label": "uncertain"}
+            parameters.fill_between(case.time, low, high, where=~case.certain, **grey)
+            against_time((norms, parameters), case.time)
+            end = min(case.time[-1], _EARLY)
+            parameters.set(ylim=(low, high), xlim=(case.time[0], end), ylabel=r"parameters $\hat\theta$")
+            titles += [name, f"{name}, first {end:g} s"]
+        letter(grid, *titles)
+        legend(*grid[::2])
+        legend(*grid[1::2])
     return figure
 
 
@@ -221,22 +241,23 @@ class GainSets(NamedTuple):
 
 def draw_gain_sets(sets: GainSets) -> Figure:
     """theta^ and |e| of one gain set, and the RMS of both errors over all gain sets, sorted."""
-    with page(WIDTH, 4.4) as figure:
-        grid = list(figure.subplots(2, 2).flat)
+    with panels(4) as (figure, grid):
         letter(grid)
         estimates(grid[0], sets.time, sets.parameters, sets.truth)
-        grid[0].set_ylabel(r"$\hat\theta$ (integral), $\theta$ dotted")
+        grid[0].set_ylabel(r"parameters $\hat\theta$")
         for i, (name, values) in enumerate(sets.followed.items()):
-            grid[1].semilogy(sets.time, positive(values), color=colour(i), label=name, linewidth=0.7)
+            look = {"linestyle": dash(i), "color": colour(i), "label": name, "linewidth": 0.7}
+            grid[1].semilogy(sets.time, positive(values), **look)
+        decades(grid[1])
         grid[1].set_ylabel("$|x - x_d|$")
-        legend_above(grid[1], 2)
         against_time(grid[:2], sets.time)
         shares(grid[2], sets.error)
         shares(grid[3], sets.parameter_error)
         labels = "RMS of $x - x_d$", r"RMS of $\hat\theta - \theta$"
         for axes, label in zip(grid[2:], labels, strict=True):
             axes.set(xscale="log", xlabel=label, ylabel="share of gain sets")
-        legend_above(grid[2], 2)
+        legend(grid[0])
+        legend(*grid[1:])
     return figure
 
 
@@ -250,28 +271,29 @@ class BoxHistory(NamedTuple):
     barrier_state: np.ndarray  # s of the first method, (T, n)
     low: np.ndarray  # (n,) -inf for none
     high: np.ndarray  # (n,)
+    units: tuple[str, ...] = ("", "")  # of the coordinates
 
 
 def draw_box(history: BoxHistory) -> Figure:
     """The first two coordinates with their walls, the distance to the nearest wall, s and the cost."""
-    with page(WIDTH, 4.6) as figure:
-        plane, margin, barrier, cost = figure.subplots(2, 2).flat
+    with panels(4, high=2.1) as (figure, grid):
+        plane, margin, barrier, cost = grid
         for i, (name, path) in enumerate(history.paths.items()):
-            plane.plot(path[:, 0], path[:, 1], dash(i), color=colour(i), label=name)
+            plane.plot(path[:, 0], path[:, 1], linestyle=dash(i), color=colour(i), label=name)
         named(margin, history.time, history.margins)
         named(cost, history.time, history.costs)
         walls(plane, history.low, history.high)
-        plane.set(xlabel="$x_1$", ylabel="$x_2$")
-        legend_of_all(figure, plane, 3)
-        margin.set_ylabel("distance to the nearest wall")
+        plane.set(xlabel=with_unit("$x_1$", history.units[0]), ylabel=with_unit("$x_2$", history.units[1]))
+        legend(margin, plane, cost)
+        margin.set_ylabel("distance to a wall")
         curves(barrier, history.time, history.barrier_state, "$s_{%d}$")
-        barrier.set_ylabel("barrier coordinates")
-        legend_above(barrier, history.barrier_state.shape[1])
+        barrier.set_ylabel("barrier coordinates $s$")
+        legend(barrier)
         cost.set_ylabel("cost of $s$ so far")
         for axes in (margin, cost):
             axes.set_ylim(bottom=0)
         against_time((margin, barrier, cost), history.time)
-        letter((plane, margin, barrier, cost))
+        letter(grid)
     return figure
 
 
@@ -302,8 +324,8 @@ def draw_avoidance(history: AvoidanceHistory) -> Figure:
     """The plane with the discs at some times, the distance, the least distances of all, and the cost."""
     from matplotlib.patches import Circle
 
-    with page(WIDTH, 4.8) as figure:
-        plane, apart, share, cost = figure.subplots(2, 2).flat
+    with panels(4, high=2.2) as (figure, grid):
+        plane, apart, share, cost = grid
         last = int(np.argmax(history.time >= 0.5 * history.time[-1]))
         shown = np.linspace(0, last, 5).round().astype(int)
         for shade, at in zip(np.linspace(0.92, 0.6, len(shown)), shown, strict=True):
@@ -311,21 +333,22 @@ def draw_avoidance(history: AvoidanceHistory) -> Figure:
                 grey = {"facecolor": f"{shade:.3f}", "edgecolor": "0.4", "linewidth": 0.4}
                 plane.add_patch(Circle(tuple(center), history.radius, **grey))
         for i, (name, path) in enumerate(history.paths.items()):
-            plane.plot(path[:, 0], path[:, 1], dash(i), color=colour(i), label=name)
+            plane.plot(path[:, 0], path[:, 1], linestyle=dash(i), color=colour(i), label=name)
             plane.plot(path[shown, 0], path[shown, 1], ".", color=colour(i), markersize=4)
         named(apart, history.time, history.distances)
         named(cost, history.time, history.costs)
         shares(share, history.nearest)
-        plane.set(xlabel="$p_1$ (m)", ylabel="$p_2$ (m)", aspect="equal")
-        legend_above(apart, 2)
+        plane.set(xlabel="$p_1$ (m)", ylabel="$p_2$ (m)")
+        plane.set_aspect("equal", adjustable="datalim")
+        legend(apart, share, cost)
         apart.axhline(0.0, color="0.2", linewidth=0.8)
         share.axvline(0.0, color="0.2", linewidth=0.8)
-        apart.set_ylabel("distance to the nearest disc (m)")
-        share.set(xlabel="least distance on the way (m)", ylabel="share of the scenarios")
+        apart.set_ylabel("distance to a disc (m)")
+        share.set(xlabel="least distance on the way (m)", ylabel="share of scenarios")
         cost.set_ylabel("cost so far")
         cost.set_ylim(bottom=0)
         against_time((apart, cost), history.time)
-        letter((plane, apart, share, cost))
+        letter(grid)
     return figure
 
 
@@ -342,11 +365,9 @@ def draw_rivals(rows: Sequence[Mapping[str, Any]]) -> Figure:
         rows: ``plant``, ``method``, ``ratio_median``, ``regulated``, ``us_median``; None where not measured.
     """
     plants = list(dict.fromkeys(row["plant"] for row in rows))
-    methods = list(dict.fromkeys(row["method"] for row in rows))
-    across = min(_COLUMNS, len(plants))
-    down = -(-len(plants) // across)
-    with page(2.4 * across + 1.6, 2.3 * down) as figure:
-        grid = subplots(figure, len(plants), across, sharex=True, sharey=True)
+    methods = list(dict.fromkeys(row["method"] for row in rows if row["ratio_median"] is not None))
+    handles: dict[str, Line2D] = {}
+    with panels(len(plants), _COLUMNS, spare=methods, high=2.0, sharex=True, sharey=True) as (figure, grid):
         for axes, plant in zip(grid, plants, strict=True):
             for row in rows:
                 if row["plant"] == plant and row["ratio_median"] is not None:
@@ -354,14 +375,13 @@ def draw_rivals(rows: Sequence[Mapping[str, Any]]) -> Figure:
                     excess = max(row["ratio_median"] - 1, _LEAST)
                     (point,) = axes.plot(row["us_median"], excess, marker(index), color=colour(index))
                     point.set(fillstyle="full" if row["regulated"] == 1 else "none", linestyle="none")
-            axes.set(xscale="log", yscale="log")
-            axes.set_title(plant.replace("_", " "), fontsize="small")
-        for axes in grid[-across:]:  # with no panel below
-            axes.set_xlabel(r"$\mu$s a control")
-            axes.tick_params(labelbottom=True)
-        for axes in grid[::across]:
-            axes.set_ylabel("median excess cost")
-        for index, method in enumerate(methods):
-            grid[0].plot([], [], marker(index), color=colour(index), linestyle="none", label=method)
-        figure.legend(loc="outside right center", title="hollow: not all regulated", title_fontsize="small")
+                    point.set_label(row["method"])
+                    if row["regulated"] == 1 or row["method"] not in handles:
+                        handles[row["method"]] = point
+            axes.set(xscale="log", yscale="log", xlabel=r"time a control ($\mu$s)")
+            axes.set_title(plant.replace("_", " "))
+            spec = axes.get_subplotspec()
+            if spec is not None and spec.is_first_col():
+                axes.set_ylabel("median excess cost")
+        legend(*grid, handles=[handles[name] for name in methods], title="hollow: not all regulated")
     return figure

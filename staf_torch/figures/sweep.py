@@ -16,7 +16,7 @@ from ..results.files import grouped
 from ..results.reader import Collection, RecordedRun, identity
 from ..results.run import as_text
 from ..tables.aggregate import half_width, mean, rank
-from .style import WIDTH, colour, marker, page, subplots, ticks
+from .style import colour, dash, legend, marker, panels, ticks
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -30,11 +30,12 @@ COST = "products_per_second"
 _OF_COST = ("optimizer", "predictor", "optimizer.inner_steps", "dt", COUNT, SEED)
 _NAMES = {"gaussian": "Gaussian", "matern": "Matérn", "inverse_multiquadric": "inverse multiquadric"}
 _MOST_PANELS = 12
-_ERROR = r"$\sup\,|V - \hat V|$ on the ball"
+_ERROR = r"$\sup\,|V - \hat V|$"  # on the ball
 _ROUNDING = (0, (6, 2))  # dashes
 _VISIBLE = 1.2  # a band this wide can be seen: it has an entry in the legend
 _COLUMNS = 3
-_HEIGHT = 2.5  # inches a row of panels
+_FAR = 1e-4  # of the least error: what lies below is not drawn
+_CELL = 0.26  # inches a row of a map is high
 
 
 class Point(NamedTuple):
@@ -219,37 +220,34 @@ def _point(x: float, errors: Sequence[float]) -> Point:
     return Point(x, math.exp(middle), math.exp(middle - width), math.exp(middle + width))
 
 
-def draw_error_against_radius(panels: Sequence[Panel], rounding: float | None) -> Figure:
+def draw_error_against_radius(shown_panels: Sequence[Panel], rounding: float | None) -> Figure:
     """Both axes logarithmic; a line a count with its 95 % band over the seeds, dotted with ideal weights.
 
     Args:
-        panels: one a kernel.
-        rounding: the error that rounding of V alone explains; a line, where it is not far below the data,
-            and in the legend with its number.
+        shown_panels: one a kernel.
+        rounding: the error that rounding of V alone explains; a line, where it is not far below the data.
     """
-    with _errors(panels) as (figure, grid):
-        for axes, shown in zip(grid, panels, strict=True):
+    with _errors(shown_panels) as (figure, grid):
+        for axes, shown in zip(grid, shown_panels, strict=True):
             ticks(axes, "x", sorted({point.x for curve in shown.curves for point in curve.points}))
             axes.set_xlabel("radius $r$ of the ball")
-        if any(curve.floor for shown in panels for curve in shown.curves):
-            grid[0].plot([], [], color="0.3", linestyle=":", label="ideal weights, local basis")
-        if rounding is not None:
-            far = ", below" if rounding <= _far_below(panels) else ""
+        if rounding is not None and rounding > min(_drawn(grid)) / 10:
             for axes in grid:
                 floor = axes.axhline(rounding, color="0.4", linestyle=_ROUNDING, linewidth=0.9)
-                floor.set_label(rf"rounding, $\varepsilon\,\max|V|$ = {rounding:.0e}{far}")
+                floor.set_label(r"rounding of $V$")
     return figure
 
 
-def draw_cost_against_accuracy(panels: Sequence[Panel], work: str = "products") -> Figure:
+def draw_cost_against_accuracy(shown_panels: Sequence[Panel], work: str = "products with $K$") -> Figure:
     """Both axes logarithmic; a line a law and predictor, or a radius, with its 95 % band over the seeds.
 
     Args:
-        panels: of `cost_against_accuracy`.
+        shown_panels: of `cost_against_accuracy`.
         work: what the work is counted in.
     """
-    with _errors(panels) as (figure, _):
-        figure.supxlabel(f"{work} with $K$ a second of trajectory", size="medium")  # too long for a panel
+    with _errors(shown_panels) as (figure, grid):
+        for axes in grid:
+            axes.set_xlabel(f"{work} a simulated second")
     return figure
 
 
@@ -260,49 +258,48 @@ def _lines(axes: Axes, shown: Panel) -> None:
     for i, curve in enumerate(shown.curves):
         x = [point.x for point in curve.points]
         (line,) = axes.plot(x, [point.middle for point in curve.points], color=colour(i), label=curve.label)
-        line.set(marker=marker(i), markersize=3.5)
+        line.set(marker=marker(i), markersize=3.5, linestyle=dash(i))
         if any(point.low < point.high for point in curve.points):
             low, high = [point.low for point in curve.points], [point.high for point in curve.points]
             axes.fill_between(x, low, high, color=colour(i), alpha=0.2, linewidth=0)
         if curve.floor:
             floor = [point.middle for point in curve.floor]
-            axes.plot([point.x for point in curve.floor], floor, ":", color=colour(i), linewidth=0.9)
+            (dots,) = axes.plot(
+                [point.x for point in curve.floor], floor, ":", color=colour(i), linewidth=0.9
+            )
+            dots.set_label("_" if i else "ideal weights")
 
 
 @contextlib.contextmanager
-def _errors(panels: Sequence[Panel]) -> Iterator[tuple[Figure, list[Axes]]]:
+def _errors(shown_panels: Sequence[Panel]) -> Iterator[tuple[Figure, list[Axes]]]:
     """Yield a page with the lines of all panels; in the end it gets limits and one legend."""
     from matplotlib.patches import Patch
 
-    with page(*_size(len(panels))) as figure:
-        grid = subplots(figure, len(panels), min(len(panels), _COLUMNS), sharey=True)
-        for axes, shown in zip(grid, panels, strict=True):
+    labels = [curve.label for curve in shown_panels[0].curves]
+    more = ["ideal weights", "rounding of V", "95 % over seeds"]
+    spare = labels + more if len(shown_panels) > 1 else ()
+    with panels(len(shown_panels), _COLUMNS, spare=spare, sharey=True) as (figure, grid):
+        for axes, shown in zip(grid, shown_panels, strict=True):
             _lines(axes, shown)
         yield figure, grid
         _label_left(grid)
-        _frame(grid, panels)
+        drawn = _drawn(grid)
+        grid[0].set_ylim(min(drawn) / 2, max(drawn) * 2)
         # The same label has the same line in every panel: one legend serves them all.
         lines: dict[str, Artist] = {str(line.get_label()): line for axes in grid for line in axes.get_lines()}
         handles = [line for label, line in lines.items() if not label.startswith("_")]
-        if any(point.high > _VISIBLE * point.low for point in _points_of(panels)):
+        handles.sort(key=lambda line: line.get_marker() == "None")  # type: ignore[attr-defined]
+        if any(point.high > _VISIBLE * point.low for point in _points_of(shown_panels)):
             handles.append(Patch(color="0.4", alpha=0.25, linewidth=0, label="95 % over seeds"))
-        rows = -(-len(handles) // (6 if len(panels) > 1 else 3))
-        columns = -(-len(handles) // rows)
-        figure.legend(handles=handles, loc="outside upper center", ncols=columns, handlelength=2.6)
+        legend(*grid, handles=handles)
 
 
-def _frame(grid: Sequence[Axes], panels: Sequence[Panel]) -> None:
-    """Half a decade around the errors, and what lies below only if it is near: wide bands are cut."""
-    middle = [point.middle for point in _points_of(panels)]
-    bottom, top = min(middle) / 3, max(middle) * 3
-    drawn = [y for axes in grid for line in axes.get_lines() for y in np.asarray(line.get_ydata(), float)]
-    near = [y for y in drawn if np.isfinite(y) and y > _far_below(panels)]
-    grid[0].set_ylim(min([bottom, *(y / 4 for y in near)]), top)
-
-
-def _far_below(panels: Sequence[Panel]) -> float:
-    """Return the least value that is drawn: less would squeeze the errors into the top of the picture."""
-    return 1e-9 / 3 * min(point.middle for point in _points_of(panels))
+def _drawn(grid: Sequence[Axes]) -> list[float]:
+    """Return the numbers of all lines but those far below the errors."""
+    lines = [line for axes in grid for line in axes.get_lines()]
+    numbers = [(line, y) for line in lines for y in np.asarray(line.get_ydata(), float) if np.isfinite(y)]
+    least = min(y for line, y in numbers if line.get_marker() != "None")
+    return [y for _, y in numbers if y >= _FAR * least]
 
 
 def _points_of(panels: Sequence[Panel]) -> list[Point]:
@@ -315,8 +312,8 @@ def draw_heat_maps(maps: Sequence[HeatMap]) -> Figure:
 
     errors = [e for shown in maps for row in shown.errors for e in row if e is not None]
     norm = LogNorm(min(errors), max(errors) if max(errors) > min(errors) else 10 * min(errors))
-    with page(*_size(len(maps), 0.9 + 0.33 * max(len(m.counts) for m in maps))) as figure:
-        grid = subplots(figure, len(maps), min(len(maps), _COLUMNS))
+    high = 0.75 + _CELL * max(len(shown.counts) for shown in maps)
+    with panels(len(maps), min(2, len(maps)), high=high) as (figure, grid):
         for axes, shown in zip(grid, maps, strict=True):
             values = np.array(shown.errors, dtype=float)  # None: NaN
             axes.set_facecolor("0.92")
@@ -338,18 +335,13 @@ def _numbers(axes: Axes, values: np.ndarray, norm: LogNorm) -> None:
     for (row, column), error in np.ndenumerate(values):
         lost = not np.isfinite(error)
         shade = "0.3" if lost else "white" if float(norm(error)) < 0.6 else "black"
-        axes.text(column, row, "-" if lost else _short(error), ha="center", va="center", color=shade, size=6)
+        axes.text(column, row, "-" if lost else _short(error), ha="center", va="center", color=shade)
 
 
 def _short(error: float) -> str:
     """Two digits without a plus or a zero in the exponent: a cell is narrow."""
     mantissa, _, exponent = f"{error:.1e}".partition("e")
     return f"{error:.2g}" if 0.01 <= error < 1000 else f"{mantissa}e{int(exponent)}"
-
-
-def _size(count: int, height: float = _HEIGHT) -> tuple[float, float]:
-    columns = min(count, _COLUMNS)
-    return (WIDTH if columns > 1 else 4.4), 0.5 + height * -(-count // columns)
 
 
 def _label_left(grid: Sequence[Axes], label: str = _ERROR) -> None:
@@ -374,7 +366,7 @@ def map_figure(found: Collection) -> Figure | None:
 def cost_figure(found: Collection) -> Figure | None:
     """Draw `cost_against_accuracy` of a sweep; None where nothing that costs was swept."""
     panels = cost_against_accuracy(found)
-    work = "multiplications" if _several(found.rows, COUNT) else "products"
+    work = "multiplications" if _several(found.rows, COUNT) else "products with $K$"
     return draw_cost_against_accuracy(panels, work) if panels else None
 
 

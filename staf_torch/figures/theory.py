@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from .style import WIDTH, colour, dash, legend_of_all, letter, marker, page, positive, subplots, ticks
+from .style import colour, dash, legend, letter, marker, panels, positive, ticks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -65,19 +65,16 @@ def draw_exponential_bound(found: Mapping[tuple[float, float], Mapping[str, floa
         found: by radius and epsilon, the counts by their names.
     """
     radii = sorted({radius for radius, _ in found})
-    columns = min(len(radii), 4)
-    with page(WIDTH, 0.5 + 2.1 * -(-len(radii) // columns)) as figure:
-        grid = subplots(figure, len(radii), columns, sharex=True, sharey=True)
+    with panels(len(radii), 3, sharex=True, sharey=True) as (figure, grid):
         for axes, radius in zip(grid, radii, strict=True):
             _bounds(axes, {epsilon: row for (r, epsilon), row in found.items() if r == radius})
             axes.set_title(f"$r = {radius:g}$")
-        for axes in grid[::columns]:
-            axes.set_ylabel("kernels $M$")
-        for axes in grid[-columns:]:
             axes.set_xlabel(r"largest error $\epsilon$")
-            axes.tick_params(labelbottom=True)
+            spec = axes.get_subplotspec()
+            if spec is not None and spec.is_first_col():
+                axes.set_ylabel("kernels $M$")
         _plain_ticks(grid[0], found)
-        legend_of_all(figure, grid[0], 6)
+        legend(*grid)
     return figure
 
 
@@ -95,31 +92,38 @@ def _bounds(axes: Axes, rows: Mapping[float, Mapping[str, float | None]]) -> Non
     epsilon = list(rows)
     for i, (name, label) in enumerate(_BOUNDS.items()):
         counts = np.array([row[name] for row in rows.values()], dtype=float)  # None: NaN
-        axes.loglog(epsilon, counts, dash(i), color=colour(i), marker=marker(i), markersize=4, label=label)
+        look = {"linestyle": dash(i), "color": colour(i), "marker": marker(i), "markersize": 4}
+        axes.loglog(epsilon, counts, label=label, **look)
     axes.set_xlim(max(epsilon) * 1.5, min(epsilon) / 1.5)  # what is asked grows to the right
 
 
 def draw_feasibility(found: Feasibility) -> Figure:
     """M that is needed along the trajectory at one radius, and for all of it against the radius."""
-    with page(WIDTH, 3.2) as figure:
-        left, right = figure.subplots(1, 2, sharey=True)
+    with panels(2, high=2.5, sharey=True) as (figure, (left, right)):
         place, label = _place(found)
         for i, epsilon in enumerate(found.epsilons):
-            style = {"color": colour(i), "label": f"$\\epsilon = {_power(epsilon)}$"}
-            left.plot(place, positive(found.pointwise[i]), dash(i), drawstyle="steps-mid", **style)
+            style = {"color": colour(i), "linestyle": dash(i), "label": f"$\\epsilon = {_power(epsilon)}$"}
+            left.plot(place, positive(found.pointwise[i]), drawstyle="steps-mid", **style)
             overall = positive(found.overall[:, i])
-            right.plot(found.radii, overall, dash(i), marker=marker(i), markersize=4, **style)
+            right.plot(found.radii, overall, marker=marker(i), markersize=4, **style)
         left.set_yscale("log")
         ticks(left, "y", found.counts)
         left.set_ylabel("centers $M$")
+        right.set_ylabel("centers $M$" if _stacked(right) else "")
         left.set_xlabel(label)
         left.margins(x=0)
         right.set_xscale("log")
         ticks(right, "x", found.radii)
         right.set_xlabel("radius $r$ of the ball")
         letter((left, right), f"at each state, $r = {found.radius:g}$", "along the whole trajectory")
-        legend_of_all(figure, right, 6)
+        legend(right, left)
     return figure
+
+
+def _stacked(axes: Axes) -> bool:
+    """Return whether the panel stands at the left edge."""
+    spec = axes.get_subplotspec()
+    return spec is not None and spec.is_first_col()
 
 
 def _place(found: Feasibility) -> tuple[np.ndarray, str]:
@@ -133,8 +137,7 @@ def _place(found: Feasibility) -> tuple[np.ndarray, str]:
 
 def draw_layouts(found: Sequence[LayoutCurve], radius: float, radii: np.ndarray) -> Figure:
     """The error against M at one radius, and against the radius with measured slopes."""
-    with page(WIDTH, 3.6) as figure:
-        left, right = figure.subplots(1, 2)
+    with panels(2, high=3.0) as (figure, (left, right)):
         for axes in (left, right):
             axes.set(xscale="log", yscale="log")
         for family in _FAMILIES:
@@ -142,13 +145,13 @@ def draw_layouts(found: Sequence[LayoutCurve], radius: float, radii: np.ndarray)
         ticks(left, "x", sorted({curve.centers for curve in found if curve.family in ("rings", "ball")}))
         left.set_xlabel("centers $M$")
         left.set_ylabel(r"$\sup\,|V - \hat V|$ on the ball")
-        left.legend(loc="lower left", handlelength=3.2)
+        legend(left)
         for i, curve in enumerate(_drawn(found)):
             _against_radius(right, i, curve, radii)
         ticks(right, "x", radii)
         right.set_xlabel("radius $r$ of the ball")
-        beside = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5), "handlelength": 3.2}
-        right.legend(title="layout, $M$: slope", **beside)
+        legend(right, title="layout, $M$: slope")
+        right.set_ylabel(left.get_ylabel() if _stacked(right) else "")
         letter((left, right), f"$r = {radius:g}$", "slopes in $r$")
     return figure
 
@@ -177,7 +180,7 @@ def _drawn(found: Sequence[LayoutCurve]) -> list[LayoutCurve]:
 
 def _against_radius(axes: Axes, i: int, curve: LayoutCurve, radii: np.ndarray) -> None:
     slope = "-" if curve.slope is None else f"{curve.slope:.2f}"
-    (line,) = axes.plot(radii, positive(curve.errors), dash(i), marker=marker(i), markersize=4)
+    (line,) = axes.plot(radii, positive(curve.errors), linestyle=dash(i), marker=marker(i), markersize=4)
     line.set(color=colour(i), label=f"{curve.family}, {curve.centers}: {slope}")
 
 
@@ -186,21 +189,25 @@ def _power(number: float) -> str:
     return f"10^{{{exponent}}}" if np.isclose(number, 10.0**exponent) else f"{number:g}"
 
 
-def draw_errors(panels: Sequence[ErrorPanel], rows: int) -> Figure:
+def draw_errors(panels_: Sequence[ErrorPanel], rows: int) -> Figure:
     """Error against radius: panels in ``rows`` rows, log-log, each row with one error axis; one legend."""
-    columns = len(panels) // rows
-    with page(max(3.6, 2.4 * columns), 2.3 * rows + 0.5) as figure:
-        grid = figure.subplots(rows, columns, sharex=True, sharey="row", squeeze=False)
-        for axes, panel in zip(grid.flat, panels, strict=False):
+    fails = "fails (in its colour)" if any(_fails(panel) for panel in panels_) else None
+    labels = [*panels_[0].error, *filter(None, [fails]), r"$\varepsilon$ of the dtype"]
+    columns = len(panels_) // rows
+    with panels(len(panels_), columns, spare=labels, sharex=True) as (figure, grid):
+        for axes, panel in zip(grid, panels_, strict=True):
             _errors(axes, panel)
-        letter(grid.flat, *(panel.title for panel in panels))
-        for axes in grid[:, 0]:
-            axes.set_ylabel(r"relative error of $\hat V$")
-        for axes in grid[-1]:
             axes.set_xlabel("radius $r$")
-        handles, labels = grid[0, 0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper center", ncols=3 if columns < 3 else 6)
+            if _stacked(axes):
+                axes.set_ylabel(r"relative error of $\hat V$")
+        letter(grid, *(panel.title for panel in panels_))
+        drawn = {str(line.get_label()): line for axes in grid for line in axes.get_lines()}
+        legend(*grid, handles=[drawn[label] for label in labels if label in drawn])
     return figure
+
+
+def _fails(panel: ErrorPanel) -> bool:
+    return not all(np.isfinite(np.asarray(errors)).all() for errors in panel.error.values())
 
 
 def _errors(axes: Axes, panel: ErrorPanel) -> None:
@@ -209,12 +216,13 @@ def _errors(axes: Axes, panel: ErrorPanel) -> None:
         error = np.asarray(errors)
         # An exact result cannot stand on a log axis: it is drawn at a tenth of the rounding unit.
         drawn = np.where(np.isfinite(error), np.maximum(error, 0.1 * panel.rounding), np.nan)
-        (line,) = axes.loglog(radius, drawn, dash(i), color=colour(i), label=label)
+        (line,) = axes.loglog(radius, drawn, linestyle=dash(i), color=colour(i), label=label)
         line.set(marker=_METHODS[i], markersize=3.8 - 0.6 * i)
         failed = radius[~np.isfinite(error)]
-        # One row of marks a method, so that two that fail together are both seen.
-        axes.plot(failed, np.full(len(failed), _FAILED * 4.0**i), "x", markersize=3, color=colour(i))
-    axes.plot([], [], "kx", markersize=3, label="fails (in its colour)")
+        if len(failed):  # one row of marks a method, so that two that fail together are both seen
+            at = np.full(len(failed), _FAILED * 4.0**i)
+            marks = {"markersize": 3, "color": colour(i), "linestyle": "none", "marker": "x"}
+            axes.plot(failed, at, label="fails (in its colour)", **marks)
     rounding = axes.axhline(panel.rounding, color="0.4", linewidth=0.8, linestyle=(0, (1, 1)))
     rounding.set_label(r"$\varepsilon$ of the dtype")
     axes.set_ylim(0.05 * panel.rounding, _TOP)

@@ -22,6 +22,7 @@ from ..experiments.registry import (
     check_animation,
     experiment,
 )
+from ..figures.style import Paper, printed_on
 from ..results.progress import SHOWN, Progress
 from ..settings.plain import to_read
 from ..settings.suggestions import without_setting
@@ -169,17 +170,21 @@ def completion(cfg: DictConfig, outcome: Outcome) -> Experiment:
         Exception: that of a job that failed, or ValueError for an animation that the experiment has not.
     """
     check_animation(cfg)
-    study = experiment(cfg.task)
-    match outcome:
-        case Failed(error):
-            raise error
-        case Deferred():
-            return study
-        case Computed(solution):
-            assert isinstance(study, BatchedExperiment)
-            return lambda cfg, directory, progress=SHOWN: study.write(cfg, directory, solution)
-        case Written():
-            return outcome.replay
+    paper, study = Paper.of(cfg.figures), experiment(cfg.task)
+
+    def left(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
+        with printed_on(paper):
+            match outcome:
+                case Computed(solution):
+                    assert isinstance(study, BatchedExperiment)
+                    return study.write(cfg, directory, solution)
+                case Written():
+                    return outcome.replay(cfg, directory, progress)
+            return study(cfg, directory, progress)
+
+    if isinstance(outcome, Failed):
+        raise outcome.error
+    return left
 
 
 def _group_and_size(settings: Flat, index: int) -> tuple[str, int]:

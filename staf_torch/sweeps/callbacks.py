@@ -19,6 +19,7 @@ from hydra.experimental.callback import Callback
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
+from ..figures.style import Paper, draws, printed_on
 from ..numerics import COMMAND_LINE, fail
 from ..results import run_record as records
 from ..results.files import COMPLETED, PAGE, ROWS
@@ -146,11 +147,14 @@ class SweepReport(Callback):
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
         """Write the report; nothing that goes wrong here may look like a sweep gone wrong."""
         directory = _directory(config)
-        figures = OmegaConf.select(config, "figures") if self._figures is None else self._figures
+        chosen = OmegaConf.select(config, "figures")
         if not directory.is_dir() or _in_vain(config):
             return
         try:
-            text = write_report(directory, figures=figures is not False)
+            chosen = True if chosen is None else chosen
+            figures = draws(chosen) if self._figures is None else self._figures
+            with printed_on(Paper.of(chosen)):
+                text = write_report(directory, figures=figures)
         except OSError as error:  # a full disk, a directory that has gone
             raise SystemExit(f"staf: no report of the sweep: {sentence(error)}") from error
         except Exception as error:

@@ -16,11 +16,23 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from ..experiments.registry import experiment
 from ..numerics.checks import integer
 from ..results.progress import SHOWN, Progress
 from ..settings.plain import ManySettings
-from .batching import Batch, Computed, Deferred, Done, Failed, Flat, Outcome, Written, batches, solve
+from .batching import (
+    DEFERRED,
+    Batch,
+    Computed,
+    Deferred,
+    Done,
+    Failed,
+    Flat,
+    Outcome,
+    Written,
+    batches,
+    completion,
+    solve,
+)
 from .hydra_compat import env_override, trusted, trusted_packages
 from .workers import LostError, Worker, ready
 
@@ -259,7 +271,7 @@ def _run_whole(cfg: DictConfig, directory: Path) -> Outcome:
     directory.mkdir(parents=True, exist_ok=True)
     with _kept_log() as lines:
         try:
-            return Written(experiment(cfg.task)(cfg, directory, SHOWN), lines)
+            return Written(completion(cfg, DEFERRED)(cfg, directory, SHOWN), lines)
         except Exception as error:
             return Failed(error)
 

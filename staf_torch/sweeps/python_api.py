@@ -154,7 +154,8 @@ def _draw_again(done: Run) -> Mapping[str, Figure]:
     if record is None or done.row is not None:
         raise ValueError(f"`Run.figures()` needs a run with its own {RUN}; got {done.directory}.")
     with tempfile.TemporaryDirectory() as folder:
-        again = run(*record["overrides"], "figures=true", "history=false", "tracker=none", directory=folder)
+        typed = (line for line in record["overrides"] if not line.startswith("figures="))
+        again = run(*typed, "figures.draw=true", "history=false", "tracker=none", directory=folder)
         return again.figures()
 
 

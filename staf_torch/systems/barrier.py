@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..numerics.angles import wrap
 from ..numerics.checks import fail, hold
-from .base import ControlAffineSystem, Linearisation
+from .base import ControlAffineSystem, Linearisation, Units
 
 Wall = float | Sequence[float | None] | Tensor | None
 _NAMED = 20  # rows that an error lists
@@ -69,6 +69,8 @@ class Barrier(ControlAffineSystem):
         self.dim, self.inputs, self.bounds = plant.dim, plant.inputs, plant.bounds
         unbounded = torch.isinf(lows) & torch.isinf(highs)
         free = unbounded.tolist()
+        own = zip(plant.units.of_states(plant.dim), free, strict=True)
+        self.units = Units(", ".join(unit if same and unit else "1" for unit, same in own), plant.units.input)
         self.periodic = tuple(k for k in plant.periodic if free[k % plant.dim])
         self._turning = tuple(k for k in plant.periodic if not free[k % plant.dim])
         below, above = 1 / (center - lows), 1 / (highs - center)  # 0 for a wall that is not there

@@ -40,6 +40,19 @@ class Units(NamedTuple):
     state: str = "1"
     input: str = "1"
 
+    def of_states(self, count: int) -> tuple[str, ...]:
+        """Return the unit of each of so many states, "" for none; of another number, all each."""
+        return _each(self.state, count)
+
+    def of_inputs(self, count: int) -> tuple[str, ...]:
+        """Return the unit of each of so many inputs, likewise."""
+        return _each(self.input, count)
+
+
+def _each(units: str, count: int) -> tuple[str, ...]:
+    words = tuple("" if (word := part.strip()) == "1" else word for part in units.split(","))
+    return words if len(words) == count else (words * count if len(words) == 1 else (units,) * count)
+
 
 class Plant(nn.Module, abc.ABC):
     """A plant with inputs, batched: what the ones in continuous and in discrete time have in common.
@@ -53,7 +66,7 @@ class Plant(nn.Module, abc.ABC):
     Attributes:
         dim: n, the number of states; None where the plant takes any.
         inputs: m, the number of inputs.
-        units: of states and inputs, for the sheet of `staf-export`.
+        units: of states and inputs, for figures, reports and the sheet of `staf-export`.
         spread: episodes of `envs` begin uniformly in [-spread, spread]^n unless told otherwise.
         periodic: coordinates that are angles in rad: x and x + 2 pi are the same state there. Costs, the LQR,
             metrics and plots take their differences in [-pi, pi].

@@ -38,7 +38,8 @@ class Clocked(Plant):
         self.plant = plant
         self.dim, self.inputs, self.bounds = plant.dim + 1, plant.inputs, plant.bounds
         self.period, self.spread = plant.period, plant.spread
-        self.units = Units(f"{plant.units.state}, s", plant.units.input)
+        states = [unit or "1" for unit in plant.units.of_states(plant.dim)]
+        self.units = Units(", ".join([*states, "s"]), plant.units.input)
         self.periodic = tuple(sorted(index % plant.dim for index in plant.periodic))
 
     @property

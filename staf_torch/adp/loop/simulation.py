@@ -7,6 +7,7 @@ import functools
 import logging
 import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,12 +20,14 @@ from ...lanes.tree import flatten, unflatten
 from ...numerics.angles import wrap
 from ...numerics.checks import choice, copied, fail, integer, positive_real, trailing
 from ...numerics.exponential_step import BENT
+from ...results import pictures
 from ...systems import ControlAffineSystem, Plant
 from ..problem.cost import Cost
 from ..problem.held_plant import RESOLVED, Holding, Substeps, fewest_and_most
 from ..problem.rules import warn_if_restless, warn_if_unstable
 from .accuracy import hardest, needed, warn_of_errors, warn_of_models
 from .controller import Carried, Controller, Feedback, Policy
+from .picture import LoopAbout, picture, summary
 from .step import ClosedLoop, LoopState, program, record, row_numbers
 
 _log = logging.getLogger(__name__)
@@ -38,7 +41,7 @@ _PAYS = (
 )
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class LoopResult:
     """A closed loop at the recorded times 0, every dt, 2 every dt, ...
 
@@ -55,6 +58,7 @@ class LoopResult:
         (torch.Size([1, 6, 2]), False, True)
         >>> list(result.recorded)  # an actor-critic records its weights: result["critic_weights"]
         []
+        >>> result.figure(width=3.4).savefig("loop.pdf")
 
         Shown by `staf experiment=adp`.
     """
@@ -66,6 +70,40 @@ class LoopResult:
     recorded: dict[str, Tensor]  # (B, T, ...) by name, of `Controller.recorded`: result["name"]
     frozen_at: Tensor  # (B,) seconds, inf for rows that never froze
     carried: Carried = ()  # by the controller at the end, (B, ...)
+    about: LoopAbout | None = dataclasses.field(default=None, compare=False)  # what ran
+
+    def __repr__(self) -> str:
+        """Return five lines: what ran, states, controls, cost, how it ended."""
+        return summary(self)
+
+    def figure(
+        self,
+        *,
+        rows: Sequence[int] | None = None,
+        lqr: bool = True,
+        width: float | None = None,
+        font: float | str | None = None,
+    ) -> Any:
+        """Draw states and controls with their units and bounds, and the cost so far.
+
+        The first of the rows has strong lines, the others thin ones; a row ends where it diverged. The LQR,
+        which runs now from the first of them, is a broad grey line, the set-point or path is dotted where it
+        is not 0. Angles are in [-pi, pi]. Where there is no LQR a line in the log says why; a result from a
+        pickle has none.
+
+        Args:
+            rows: which; None for the first eight.
+            lqr: whether to draw the LQR's run.
+            width: inches, 7.2 by default; a column of a paper is 3.4.
+            font: of all text: size in pt, family, or both, as ``"9 serif"``; 8 pt by default.
+
+        Returns:
+            A `matplotlib.figure.Figure`.
+
+        Raises:
+            ValueError: if an argument breaks its rule.
+        """
+        return pictures.draw(picture(self, rows, lqr), width, font)
 
     def __getitem__(self, name: str) -> Tensor:
         """(B, T, ...) of what the controller recorded.
@@ -102,10 +140,12 @@ class LoopResult:
 
     def split(self, rows: Sequence[int]) -> list[LoopResult]:
         """The results of so many rows each, in their order."""
-        fields = [getattr(self, field.name) for field in dataclasses.fields(self) if field.name != "time"]
-        leaves, structure = flatten(fields)
+        leaves, structure = flatten([getattr(self, name) for name in _OF_ROWS])
         parts = zip(*(leaf.split(rows) for leaf in leaves), strict=True)
-        return [LoopResult(self.time, *unflatten(structure, iter(part))) for part in parts]
+        return [LoopResult(self.time, *unflatten(structure, iter(part)), self.about) for part in parts]
+
+
+_OF_ROWS = ("state", "control", "running_cost", "recorded", "frozen_at", "carried")
 
 
 def simulate(
@@ -212,9 +252,15 @@ def simulate(
         strained = ~(last.bent <= BENT * reach) & torch.isfinite(reach)
         if integrator == "euler" and system.period is None:
             strained[:_EULER] = True
-        if not bool(strained.any()):
-            return result
-        return whole.checked(loop, result, strained, substeps is None and integrator != "euler")
+        if bool(strained.any()):
+            result = whole.checked(loop, result, strained, substeps is None and integrator != "euler")
+
+    def again(other: Controller, start: Tensor) -> LoopResult:
+        same = {"integrator": integrator, "substeps": substeps, "renew": renew, "limit": limit}
+        return simulate(other, system, cost, start, dt=dt, steps=steps, every=every, **same)  # type: ignore[arg-type]
+
+    about = LoopAbout.of(controller, system, loop.cost, None if renew else dt, again)
+    return dataclasses.replace(result, about=about)
 
 
 def _beginning(loop: ClosedLoop, plain: Program, steps: int) -> LoopProgram:
@@ -282,12 +328,11 @@ class _LoopRun:
         except (RuntimeError, ValueError):  # the controller has numbers of all rows
             alone = False
             other, _ = whole.of(loop)
-        fields = [field.name for field in dataclasses.fields(result) if field.name != "time"]
-        kept, structure = flatten([getattr(result, name) for name in fields])
-        new = flatten([getattr(other, name) for name in fields])[0]
+        kept, structure = flatten([getattr(result, name) for name in _OF_ROWS])
+        new = flatten([getattr(other, name) for name in _OF_ROWS])[0]
         pairs = zip(kept, new, strict=True)
         mixed = [old.index_copy(0, rows, fresh if alone else fresh[rows]) for old, fresh in pairs]
-        return LoopResult(result.time, *unflatten(structure, iter(mixed)))
+        return LoopResult(result.time, *unflatten(structure, iter(mixed)), result.about)
 
 
 def _run(

@@ -1,0 +1,203 @@
+"""A closed loop to look at: five lines, and a picture with the LQR's run beside."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import math
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from ...numerics.angles import wrap
+from ...numerics.checks import fail
+from ...results.pictures import LoopPicture
+from ...systems import Clocked, Plant, Units
+from ..problem.cost import Cost
+from .controller import LQR, Controller, Feedback
+
+if TYPE_CHECKING:
+    from .simulation import LoopResult
+
+_log = logging.getLogger(__name__)
+_DRAWN = 8  # rows
+_NAMED = 6  # entries of a vector in a line
+_ZERO = 1e-9  # of the largest state: a set-point that is not drawn
+
+
+@dataclasses.dataclass(frozen=True)
+class LoopAbout:
+    """What ran: words, units and bounds, and what a picture computes with: that stays behind in a pickle."""
+
+    plant: str
+    controller: str
+    units: Units
+    periodic: tuple[int, ...]
+    clock: bool  # whether the last state is the time
+    low: Tensor | None  # (m,) of the inputs; None for none at all
+    high: Tensor | None
+    cost: Cost | None = None  # around the plant
+    beside: Callable[[Tensor], LoopResult] | None = None  # the LQR's run from states (R, n)
+
+    @classmethod
+    def of(
+        cls,
+        controller: Controller,
+        system: Plant,
+        cost: Cost,
+        period: float | None,
+        run: Callable[[Controller, Tensor], LoopResult],
+    ) -> LoopAbout:
+        """Return it of a loop.
+
+        Args:
+            controller: as in `simulate`.
+            system: likewise.
+            cost: around the plant.
+            period: for which a control is held, s; None where it follows the state.
+            run: the loop of another controller, from other states.
+        """
+        bounds, clock = cost.bounds, isinstance(system, Clocked)
+        limits = (None, None) if bounds is None else (bounds.low, bounds.high)
+        itself = isinstance(controller, Feedback) and isinstance(controller.policy, LQR)
+        plant = type(system.plant if isinstance(system, Clocked) else system).__name__
+        return cls(
+            *(plant, controller.label, system.units, system.periodic, clock, *limits),
+            cost=cost,
+            beside=None if itself else lambda x0: run(Feedback(LQR(system, cost, period)), x0),
+        )
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "cost": None, "beside": None}
+
+
+def summary(result: LoopResult) -> str:
+    """Return five lines: what ran, states, inputs, costs, how it ended."""
+    about = result.about
+    rows, n, m = len(result.state), result.state.shape[-1], result.control.shape[-1]
+    who = "" if about is None else f"{about.plant} with {about.controller}, "
+    states = Units().of_states(n) if about is None else about.units.of_states(n)
+    inputs = Units().of_inputs(m) if about is None else about.units.of_inputs(m)
+    bounded = ""
+    if about is not None and about.low is not None and about.high is not None:
+        bounded = f"; bounds {_numbers(about.low)} to {_numbers(about.high)}"
+    far = _far(result)
+    end = "" if far is None else f"|x - wanted| up to {float(far.max()):.3g}, "
+    kept = f"; recorded: {', '.join(result.recorded)}" if result.recorded else ""
+    cost = result.cost
+    spread = f"{float(cost.min()):.4g} to {float(cost.max()):.4g}, median {float(cost.median()):.4g}"
+    return "\n".join(
+        [
+            f"LoopResult: {who}{rows} {'row' if rows == 1 else 'rows'}, {len(result.time)} times, "
+            f"0 to {float(result.time[-1]):g} s",
+            f"  state    {_ranges('x', result.state, states)}",
+            f"  control  {_ranges('u', result.control, inputs)}{bounded}",
+            f"  cost     {f'{float(cost[0]):.4g}' if rows == 1 else spread}",
+            f"  end      {end}{int(result.diverged.sum())} of {rows} diverged{kept}",
+        ]
+    )
+
+
+def _numbers(values: Tensor) -> str:
+    numbers = [f"{value:g}" for value in values.tolist()]
+    return numbers[0] if len(set(numbers)) == 1 else f"({', '.join(numbers[:_NAMED])})"
+
+
+def _ranges(letter: str, values: Tensor, units: Sequence[str]) -> str:
+    """Return the least and the largest number of each entry, (..., k)."""
+    flat = values.reshape(-1, values.shape[-1]).cpu()
+    low = torch.where(flat.isnan(), torch.inf, flat).amin(0).tolist()
+    high = torch.where(flat.isnan(), -torch.inf, flat).amax(0).tolist()
+    words = [
+        f"{letter}{i + 1} {a:.3g} to {b:.3g} {unit}".rstrip() if a <= b else f"{letter}{i + 1} nowhere"
+        for i, (a, b, unit) in enumerate(zip(low, high, units, strict=True))
+    ]
+    more = f", ... {letter}{len(words)}" if len(words) > _NAMED else ""
+    return ", ".join(words[:_NAMED]) + more
+
+
+def _far(result: LoopResult) -> Tensor | None:
+    """Return the distance of the last states from where they should be, (B,)."""
+    about = result.about
+    if about is None or about.cost is None:
+        return None
+    return about.cost.deviation(result.state[:, -1]).norm(dim=-1)
+
+
+def picture(result: LoopResult, rows: Sequence[int] | None, lqr: bool) -> LoopPicture:
+    """Return what `LoopResult.figure` draws.
+
+    Raises:
+        ValueError: if a row is not there.
+    """
+    about, count = result.about, len(result.state)
+    chosen = list(range(min(count, _DRAWN))) if rows is None else [int(row) for row in rows]
+    if not chosen or not all(-count <= row < count for row in chosen):
+        raise fail("LoopResult.figure", "rows", f"must be some of the {count} rows, from 0 on", rows)
+    dim, inputs = result.state.shape[-1], result.control.shape[-1]
+    units, words, clock, low, high = Units(), "", False, None, None
+    if about is not None:
+        units, clock, low, high = about.units, about.clock, about.low, about.high
+        words = f"{about.plant}, {about.controller}"
+    if len(chosen) < count:
+        words += f", {len(chosen)} of {count} rows"
+    none = torch.full((inputs,), math.inf)
+    return LoopPicture(
+        *(words, result.time.cpu().numpy(), *_arrays(result, chosen)),
+        *(units.of_states(dim)[: dim - clock], units.of_inputs(inputs)),
+        (-none if low is None else low).cpu().numpy(),
+        (none if high is None else high).cpu().numpy(),
+        _wanted(result, chosen[0]),
+        _beside(result, chosen[0]) if lqr else None,
+    )
+
+
+def _arrays(result: LoopResult, rows: Sequence[int]) -> tuple[Any, Any, Any]:
+    """State, control and cost of some rows, with gaps where an angle jumps and once a row is frozen."""
+    at = torch.tensor(rows, device=result.state.device)
+    state, control, cost = (
+        part.index_select(0, at).detach().cpu().double().clone()
+        for part in (result.state, result.control, result.running_cost)
+    )
+    periodic = () if result.about is None else result.about.periodic
+    state = _without_jumps(state, periodic)
+    if control.shape[1] > 1:  # the last control is held to the end
+        control[:, -1] = control[:, -2]
+    frozen = result.time > result.frozen_at[at].cpu()[:, None]  # (R, T)
+    cost[frozen] = torch.nan
+    state[frozen], control[frozen] = torch.nan, torch.nan
+    return state.numpy(), control.numpy(), cost.numpy()
+
+
+def _beside(result: LoopResult, row: int) -> tuple[Any, Any, Any] | None:
+    """The LQR's run from the same state; a line in the log where there is none."""
+    about = result.about
+    if about is None or about.beside is None:
+        return None
+    try:
+        with torch.no_grad():
+            return _arrays(about.beside(result.state[[row], 0]), [0])
+    except (ValueError, RuntimeError) as error:
+        _log.warning("no LQR beside this loop: %s", str(error).partition("\n")[0])
+        return None
+
+
+def _wanted(result: LoopResult, row: int) -> Any | None:
+    """The set-point or the path at all times, (T, n); None where it is 0 or not known."""
+    about = result.about
+    if about is None or about.cost is None:
+        return None
+    x = result.state[row].detach()
+    wanted = _without_jumps((x - about.cost.deviation(x)).cpu().double(), about.periodic)
+    states = wanted[:, : wanted.shape[-1] - about.clock]
+    return wanted.numpy() if bool((states.abs() > _ZERO * x.abs().max().cpu()).any()) else None
+
+
+def _without_jumps(x: Tensor, periodic: Sequence[int]) -> Tensor:
+    """Return states (..., T, n) with angles in [-pi, pi], and a gap in a line where one jumps by a turn."""
+    x = wrap(x, periodic)
+    for k in periodic:
+        x[..., 1:, k][x[..., k].diff(dim=-1).abs() > math.pi] = torch.nan
+    return x

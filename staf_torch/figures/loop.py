@@ -1,0 +1,147 @@
+"""States, controls and cost of a closed loop over time, with units and bounds, another loop beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..results.pictures import LoopPicture
+from .style import Paper, against_time, colour, dash, legend, letter, panels, printed_on, size
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_BOUND = (0, (7, 2))  # dashes
+_MOST_TIMES = 4000  # more are thinned out
+_NAMED = 3  # entries that the name of an axis lists
+_IN_A_LEGEND = 8
+_SEEN = 5.0  # times the range of a control, up to which an axis is stretched to its bounds
+
+Group = tuple[str, list[int]]
+"""Name of an axis, and the entries of a vector that it shows."""
+
+
+def with_unit(name: str, unit: str) -> str:
+    """Return `name (unit)`, the name alone of what has no unit."""
+    return name if unit in ("", "1") else f"{name} ({unit})"
+
+
+def by_unit(whole: str, letter: str, units: Sequence[str]) -> list[Group]:
+    """Group the entries of a vector by their units: an axis has one.
+
+    Args:
+        whole: name of an axis that shows all entries, as ``state $x$``.
+        letter: of an entry.
+        units: of every entry, "" for none.
+    """
+    found: dict[str, list[int]] = {}
+    for i, unit in enumerate(units):
+        found.setdefault(unit, []).append(i)
+    if len(found) == 1:
+        return [(with_unit(whole, units[0]), list(range(len(units))))]
+    groups = []
+    for unit, entries in found.items():
+        names = [f"${letter}_{{{i + 1}}}$" for i in entries]
+        short = ", ".join(names) if len(names) <= _NAMED else f"{names[0]} to {names[-1]}"
+        groups.append((with_unit(short, unit), entries))
+    return groups
+
+
+def draw_loop(picture: LoopPicture, width: object = None, font: object = None) -> Figure:
+    """A panel for the states of each unit, for the inputs of each, and the cost so far.
+
+    The first row has strong lines, the others thin ones; the other loop is a broad grey line behind. A row
+    ends where it diverged.
+    """
+    thinned = slice(None, None, -(-len(picture.time) // _MOST_TIMES))
+    time = picture.time[thinned]
+    states = by_unit("state $x$", "x", picture.state_units)
+    inputs = by_unit("control $u$", "u", picture.input_units) if picture.input_units else []
+    with (
+        printed_on(Paper.chosen("LoopResult.figure", "", width, font)),
+        panels(len(states) + len(inputs) + 1) as (figure, grid),
+    ):
+        left, titles = iter(grid), []
+        other = [None] * 3 if picture.beside is None else [each[:, thinned] for each in picture.beside]
+        for name, entries in states:
+            axes = next(left)
+            values = [_of(part, entries) for part in (picture.state[:, thinned], other[0])]
+            _vector(axes, time, *values, "x", entries, many=len(picture.state_units) > 1)
+            if picture.wanted is not None:
+                for k, entry in enumerate(entries):
+                    line = picture.wanted[thinned, entry]
+                    axes.plot(time, line, ":", color="0.2", label=None if k else "wanted")
+            axes.set_ylabel(name)
+            titles.append("")
+        for name, entries in inputs:
+            axes = next(left)
+            values = [_of(part, entries) for part in (picture.control[:, thinned], other[1])]
+            _vector(axes, time, *values, "u", entries, many=len(picture.input_units) > 1, held=True)
+            titles.append(bounds(axes, picture.low[entries], picture.high[entries]))
+            axes.set_ylabel(name)
+        axes = next(left)
+        _vector(axes, time, picture.cost[:, thinned, None], _column(other[2]), "J", [0])
+        axes.set_ylabel("cost so far")
+        against_time(grid, time)
+        letter(grid, *titles, "")
+        most = int(130 * grid[0].get_position().width * figure.get_size_inches()[0] / size())
+        title = picture.title if len(picture.title) <= most else f"{picture.title[: most - 3]}..."
+        grid[0].set_title(f"(a) {title}", loc="left")
+        for axes in grid:
+            if 1 < len(axes.get_legend_handles_labels()[0]) <= _IN_A_LEGEND:
+                legend(axes)
+    return figure
+
+
+def _of(values: np.ndarray | None, entries: list[int]) -> np.ndarray | None:
+    return None if values is None else values[..., entries]
+
+
+def _column(values: np.ndarray | None) -> np.ndarray | None:
+    return None if values is None else values[..., None]
+
+
+def _vector(
+    axes: Axes,
+    time: np.ndarray,
+    values: np.ndarray | None,
+    beside: np.ndarray | None,
+    letter: str,
+    entries: Sequence[int],
+    many: bool = False,
+    held: bool = False,
+) -> None:
+    """Draw entries (R, T, k) of all rows, those of the other loop behind; as steps where they are held."""
+    steps = {"drawstyle": "steps-post"} if held else {}
+    assert values is not None
+    for k in range(len(entries)) if beside is not None else ():
+        for row in beside[::-1, :, k]:
+            axes.plot(time, row, color="0.7", linewidth=2.4, solid_capstyle="butt", **steps)
+    if beside is not None:
+        axes.get_lines()[-1].set_label("LQR")
+    for k, entry in enumerate(entries):
+        look = {"linestyle": dash(k), "color": colour(k), **steps}
+        for row in values[1:, :, k]:
+            axes.plot(time, row, linewidth=0.5, alpha=0.6, **look)
+        name = "this loop" if letter == "J" else f"${letter}_{{{entry + 1}}}$" if many else f"${letter}$"
+        axes.plot(time, values[0, :, k], label=name, **look)
+
+
+def bounds(axes: Axes, low: np.ndarray, high: np.ndarray) -> str:
+    """Draw the bounds of inputs, (m,) each; of those far from all that is drawn, return a word."""
+    limits = {float(each) for each in (*low, *high) if np.isfinite(each)}
+    bottom, top = axes.get_ylim()
+    reach = _SEEN * (top - bottom)
+    seen = {each for each in limits if top - reach < each < bottom + reach}
+    for each in sorted(limits):
+        line = axes.axhline(each, color="0.25", linewidth=0.9, linestyle=_BOUND)
+        if each == min(seen, default=None):
+            line.set_label("bounds" if len(seen) > 1 else "bound")
+    ends = [bottom, top, *seen]
+    room = 0.05 * (max(ends) - min(ends)) if seen else 0.0
+    axes.set_ylim(min(bottom, min(ends) + (-room if min(ends) in seen else 0)), max(top, max(ends) + room))
+    beyond = sorted(limits - seen)
+    return f"beyond: bounds {', '.join(f'{each:g}' for each in beyond)}" if beyond else ""
