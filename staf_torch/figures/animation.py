@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from .style import STYLE, WIDTH, colour, legend_above
+from .style import Paper, colour
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -23,6 +23,7 @@ KINDS = ("gif", "html")
 FRAMES = 60
 _FRAMES_PER_SECOND, _DPI = 10, 84
 _LEVELS = 14
+_LEGEND = 0.25  # of a vertical axis, for the legend above what moves
 _PAGE_DPI, _COLOURS = 125, 64  # 900 points across
 _PAGE = Path(__file__).with_name("animation.html")
 
@@ -63,8 +64,8 @@ def animate(scene: Scene, kind: str) -> dict[str, bytes]:
     import matplotlib
     from matplotlib.figure import Figure
 
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 3.3), layout="constrained")
+    with matplotlib.rc_context(Paper().style()):
+        figure = Figure(figsize=(Paper().width, 3.3), layout="constrained")
         stage = AnimationStage(figure, scene)
         stage.show(0)
         figure.draw_without_rendering()
@@ -164,12 +165,13 @@ class AnimationStage:
                 self._lines.append((drawn, values))
         axes.set(xlim=(-1, 1), xlabel="place in the ball (radii, along the way)")
         if scene.relative:
-            axes.set_ylim(-0.15 if scene.value is not None else -1.15, 1.15)
+            axes.set_ylim(-0.15 if scene.value is not None else -1.15, 1.15 + _LEGEND)
             axes.set_ylabel("share of the largest")
         elif self._lines:
-            axes.set_ylim(*_limits(self._lines[0][1]))
+            low, high = _limits(self._lines[0][1])
+            axes.set_ylim(low, high + _LEGEND * (high - low))
         if self._lines:
-            legend_above(axes, len(self._lines))
+            axes.legend(loc="upper right", ncols=len(self._lines))
 
     def _draw_curves(self, axes: Axes) -> None:
         scene, (title, values, ideal) = self._scene, self._scene.curves

@@ -23,7 +23,7 @@ def wave(*shape: int, low: float = 0.2) -> np.ndarray:
 
 def visible(figure: Figure) -> list[Axes]:
     """The panels."""
-    return [axes for axes in figure.axes if axes.get_visible()]
+    return [axes for axes in figure.axes if axes.get_visible() and axes.get_label() != "<legend>"]
 
 
 def lines(axes: Axes) -> list[Curve]:
@@ -49,14 +49,14 @@ def holds(axes: Axes, curves: Sequence[Curve], names: tuple[str, str], **more: A
     for limit, want in more.items():
         np.testing.assert_allclose(getattr(axes, f"get_{limit}")(), want)
     named = [line for line in axes.get_lines() if not str(line.get_label()).startswith("_")]
-    looks = [(line.get_color(), line.get_linestyle(), line.get_marker()) for line in named]
+    looks = [(line.get_color(), str(line.get_linestyle()), line.get_marker()) for line in named]
     assert len(set(looks)) == len(looks)  # no two of one look
 
 
-def legend(thing: Any) -> list[str]:
-    """The entries of a legend of a panel, or of a whole figure."""
-    found = thing.get_legend() if isinstance(thing, Axes) else thing.legends[0]
-    return [text.get_text() for text in found.get_texts()]
+def legend(figure: Figure) -> list[str]:
+    """The entries of the legends of a figure."""
+    found = [axes.get_legend() for axes in figure.axes]
+    return [text.get_text() for each in found if each is not None for text in each.get_texts()]
 
 
 def span(along: np.ndarray) -> tuple[float, float]:

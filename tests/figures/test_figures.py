@@ -4,18 +4,34 @@ from __future__ import annotations
 
 import io
 import pkgutil
+import re
 import subprocess
 import sys
+from typing import Any
 
 import matplotlib
 import numpy as np
+import pytest
 from command_line import environment
+from figures.drawing import visible
+from figures.test_drawn import FIGURES
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from PIL import Image
 
 from staf_torch import figures
 from staf_torch.figures.chase import ConvergenceCurve, draw_convergence
-from staf_torch.figures.style import colour, curves, dash, images, keep_figures, marker, page
+from staf_torch.figures.style import (
+    Paper,
+    colour,
+    curves,
+    dash,
+    images,
+    keep_figures,
+    marker,
+    page,
+    printed_on,
+)
 
 
 def test_images_are_the_same_on_every_run_a_png_and_a_pdf_with_fonts_that_a_journal_takes() -> None:
@@ -30,15 +46,77 @@ def test_images_are_the_same_on_every_run_a_png_and_a_pdf_with_fonts_that_a_jour
 
 def test_the_style_is_ours_whatever_the_caller_has_set_and_is_taken_back() -> None:
     with matplotlib.rc_context({"font.size": 30, "axes.grid": False}):
-        with page(3, 2) as figure:
+        with page(2) as figure:
             axes = figure.subplots()
             axes.set_xlabel("time (s)")
         assert axes.xaxis.label.get_size() == 8
         assert matplotlib.rcParams["font.size"] == 30
 
 
+@pytest.mark.parametrize("name", FIGURES)
+def test_in_a_column_a_figure_has_type_of_8_pt_and_legends_in_its_axes_of_lines_that_are_seen(
+    name: str,
+) -> None:
+    with printed_on(Paper.of({"width": 3.4})):
+        figure = FIGURES[name]().figure
+    width, height = figure.get_size_inches()
+    assert width == 3.4
+    assert height < 9.5  # inches: a page
+    ink = figure.get_tightbbox()
+    assert min(ink.x0, ink.y0) > -0.02
+    assert ink.x1 < width + 0.02
+    assert ink.y1 < height + 0.02
+    assert {text.get_size() for text in figure.findobj(Text) if text.get_text()} == {8.0}
+    for axes in figure.axes:
+        if axes.get_legend() is None:
+            continue
+        frame, box = axes.get_window_extent().padded(1), axes.get_legend().get_window_extent()
+        assert frame.x0 < box.x0 < box.x1 < frame.x1
+        assert frame.y0 < box.y0 < box.y1 < frame.y1
+        for entry in (text.get_text() for text in axes.get_legend().get_texts()):
+            assert any(entry == part.get_label() and _seen(part) for part in _parts(figure)), entry
+
+
+def _parts(figure: Figure) -> list[Any]:
+    return [part for axes in visible(figure) for part in (*axes.get_lines(), *axes.collections)]
+
+
+def _seen(part: Any) -> bool:
+    """A line that has points within its axes; a band, anyway."""
+    if not hasattr(part, "get_xydata"):
+        return True
+    points = part.get_transform().transform(part.get_xydata())
+    frame = part.axes.get_window_extent().padded(1)
+    return bool(((points > frame.min) & (points < frame.max)).all(1).any())
+
+
+@pytest.mark.parametrize(
+    ("figures", "paper"),
+    [
+        (True, Paper()),
+        ({"width": 3.4, "font": 9}, Paper(3.4, 9.0)),
+        ({"font": "serif"}, Paper(family="serif")),
+        ({"width": 5, "font": "7.5 DejaVu Sans"}, Paper(5.0, 7.5, "DejaVu Sans")),
+        ({"width": 1.0}, "figures.width=...` must be inches, from 2 to 40; got 1.0"),
+        ({"width": "wide"}, "figures.width"),
+        ({"width": float("nan")}, "figures.width"),
+        ({"font": "Comic Sands"}, "figures.font=...` must name a font that is installed"),
+        ({"font": 0}, "figures.font=...` must be a size in pt, from 3 to 40, a family, or both; got 0"),
+        ({"font": True}, "figures.font"),
+        ({"fonts": 8}, "figures=...` must be true or false, or have draw, width and font"),
+        ("maybe", "figures"),
+    ],
+)
+def test_a_width_and_a_font_are_read_as_written_or_refused(figures: object, paper: Paper | str) -> None:
+    if isinstance(paper, Paper):
+        assert Paper.of(figures) == paper
+        return
+    with pytest.raises(ValueError, match=re.escape(paper)):
+        Paper.of(figures)
+
+
 def plain() -> Figure:
-    with page(3.0, 2.0) as figure:
+    with printed_on(Paper(3.0)), page(2.0) as figure:
         axes = figure.subplots()
         axes.plot([0, 1], [1, 2], label="a")
         axes.set_ylabel("a long name\nin three\nlines")
@@ -49,7 +127,7 @@ def test_a_page_is_laid_out_once_with_room_for_its_names() -> None:
     figure = plain()
     (axes,) = figure.axes
     place = axes.get_position().bounds
-    with page(3.0, 2.0) as other:
+    with printed_on(Paper(3.0)), page(2.0) as other:
         other.subplots().plot([0, 1], [1, 2])
     assert place[0] > other.axes[0].get_position().x0 + 0.05
     with matplotlib.rc_context({"savefig.dpi": 50, "font.size": 30}):  # of the caller's own

@@ -173,8 +173,8 @@ def test_work_is_counted_in_products_or_where_centers_were_swept_in_multiplicati
     assert all(point.low < point.middle < point.high for point in curve.points)
     figure = sweep.cost_figure(found)
     assert figure is not None
-    words = "multiplications" if len(counts) > 1 else "products"
-    assert figure.get_supxlabel() == f"{words} with $K$ a second of trajectory"
+    words = "multiplications" if len(counts) > 1 else "products with $K$"
+    assert figure.axes[0].get_xlabel() == f"{words} a simulated second"
 
 
 def test_a_sweep_of_nothing_that_a_figure_shows_has_none(runs: Any) -> None:
