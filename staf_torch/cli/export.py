@@ -20,6 +20,7 @@ from ..deploy.onnx_loops import in_loops
 from ..deploy.sheet import Port
 from ..lanes.emit.identifiers import checked_names
 from ..numerics.checks import choice, fail
+from ..results.build import processor
 from ..results.files import write_text
 from ..results.untrusted import visible
 from ..settings.chase import DTYPES
@@ -193,7 +194,7 @@ def _page(
         **{way: [dataclasses.asdict(port) for port in given] for way, given in ports.items()},
         "work": dataclasses.asdict(work),
         "runtime": _RUNTIMES[ends["to"]],
-        "machine": sheet.machine(),
+        "machine": processor(),
         **facts,
     }
     write_text(path.with_name(path.name + ".json"), json.dumps(page, indent=2, allow_nan=False) + "\n")

@@ -159,6 +159,9 @@ def _rendered(found: Collection, options: argparse.Namespace) -> bytes:
     about = Print(options.caption, options.label, options.rename, options.split, options.wide)
     if kind in _READ:
         return _READ[kind](table, about).encode()
+    if kind == "json":  # a list of rows has no place for them
+        for note in table.notes:
+            print(f"note: {visible(note)}", file=sys.stderr)
     if kind in _PLAIN:
         return _PLAIN[kind](table).encode()
     if options.output is None:

@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import math
 import os
-import platform
 import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
@@ -134,15 +133,6 @@ def _one_core() -> Iterator[None]:
         yield
     finally:
         os.sched_setaffinity(0, before)
-
-
-def machine() -> str:
-    """The processor that the latency is of."""
-    with contextlib.suppress(OSError), open("/proc/cpuinfo", encoding="utf-8") as lines:
-        for line in lines:
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
 
 
 def worst_difference(got: tuple[Tensor, ...], wanted: tuple[Tensor, ...]) -> list[float]:

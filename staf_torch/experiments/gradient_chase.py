@@ -7,7 +7,7 @@ import dataclasses
 import logging
 import math
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -242,7 +242,16 @@ def _summarise(title: Title, metrics: dict[str, float | None]) -> None:
     _log.info(row, "excess F(a) - F(w)", *map(show, ("ultimate_excess", "ultimate_excess_before")), ideal)
     _log.info("  error on the ball %s, gradient error %s", show("ball_error"), show("gradient_error"))
     _log.info(
-        "  condition number %s, settled after %s s, contraction violations %s, diverged %s",
-        *map(show, ("condition_number", "settling_time")),
+        "  condition number %s, %s, contraction violations %s, diverged %s",
+        show("condition_number"),
+        _settled(metrics["settling_time"], show),
         *map(show, ("contraction_violations", "diverged_fraction")),
     )
+
+
+def _settled(time: float | None, show: Callable[[str], str]) -> str:
+    """Say from when on the excess is at most its largest value after `settle_time`: maybe from the start."""
+    if time is None:
+        return "excess not known"
+    since = "at no time above" if time == 0 else f"from {show('settling_time')} s on at most"
+    return f"excess {since} its ultimate {show('ultimate_excess')}"

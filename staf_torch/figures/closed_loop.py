@@ -149,14 +149,18 @@ def draw_comparison(ratios: Mapping[str, np.ndarray]) -> Figure:
             share = np.arange(1, len(values) + 1) / len(values)
             finite = np.isfinite(values)
             if finite.any():
-                look = {"linestyle": dash(i // 7 + i), "color": colour(i), "label": name}
+                look = {"linestyle": dash(i), "color": colour(i), "label": name}
                 axes.step(values[finite], share[finite], where="post", **look)
         axes.set_xscale("log")
-        axes.set_xlim(known.min(), min(2 * known.max(), _MOST_EXCESS)) if len(known) else None
+        if len(known):
+            axes.set_xlim(known.min(), min(2 * known.max(), _MOST_EXCESS))
+        else:
+            axes.text(0.5, 0.5, "no state was regulated", transform=axes.transAxes, ha="center")
         axes.set_ylim(0, 1.02)
         axes.set_xlabel("excess cost $J/J^* - 1$")
         axes.set_ylabel("share of initial states regulated")
-        legend(axes, handles=axes.get_lines())
+        if len(known):
+            legend(axes, handles=axes.get_lines())
     return figure
 
 
@@ -209,7 +213,7 @@ def draw_faults(cases: Mapping[str, FaultPicture]) -> Figure:
             norms.set_ylabel("$|x|$")
             estimates(parameters, case.time, case.parameters, case.truth)
             low, high = _frame(case)
-            grey = {"color": "0.88", "linewidth": 0, "zorder": 0, "label": "uncertain"}
+            grey: dict[str, Any] = {"color": "0.88", "linewidth": 0, "zorder": 0, "label": "uncertain"}
             parameters.fill_between(case.time, low, high, where=~case.certain, **grey)
             against_time((norms, parameters), case.time)
             end = min(case.time[-1], _EARLY)

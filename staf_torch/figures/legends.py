@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 SPARE = "<legend>"
 """Label of axes that hold a legend and nothing else."""
-_CORNERS = {  # and the share of the free room that is left and below
+_CORNERS: dict[Any, tuple[float, float]] = {  # and the share of the free room that is left and below
     "upper right": (1.0, 1.0),
     "upper left": (0.0, 1.0),
     "lower right": (1.0, 0.0),
@@ -84,7 +84,7 @@ def _in_a_free_place(axes: Axes, handles: dict[str, Artist], title: str | None) 
     return False
 
 
-def _flattest(axes: Axes, handles: dict[str, Artist], title: str | None, at: str) -> Legend:
+def _flattest(axes: Axes, handles: dict[str, Artist], title: str | None, at: Any) -> Legend:
     """Draw it with as many columns as the axes are wide."""
     for columns in reversed(_columns(len(handles))):
         legend = _legend(axes, handles, title, columns, at)
@@ -99,8 +99,8 @@ def _columns(count: int) -> list[int]:
     return [-(-count // each) for each in rows]
 
 
-def _legend(axes: Axes, handles: dict[str, Artist], title: str | None, columns: int, at: str) -> Legend:
-    legend = axes.legend(
+def _legend(axes: Axes, handles: dict[str, Artist], title: str | None, columns: int, at: Any) -> Legend:
+    legend: Legend = axes.legend(
         list(handles.values()), list(handles), title=title, ncols=columns, loc=at, borderaxespad=0.3
     )
     legend.set_in_layout(False)
@@ -109,14 +109,10 @@ def _legend(axes: Axes, handles: dict[str, Artist], title: str | None, columns: 
 
 def _taken(axes: Axes) -> np.ndarray:
     """Return points on all that is drawn, (K, 2), on the screen."""
-    parts: list[np.ndarray] = [np.empty((0, 2))]
-    for line in axes.get_lines():
-        parts.append(_along(line.get_transform().transform(line.get_xydata())))
-    for patch in axes.patches:
-        parts.append(patch.get_transform().transform(patch.get_path().vertices))
-    for each in axes.collections:
-        parts += _outlines(each)
-    return np.concatenate(parts)
+    lines = (_along(line.get_transform().transform(line.get_xydata())) for line in axes.get_lines())
+    patches = (patch.get_transform().transform(patch.get_path().vertices) for patch in axes.patches)
+    bands = (outline for each in axes.collections for outline in _outlines(each))
+    return np.concatenate([np.empty((0, 2)), *lines, *patches, *bands])
 
 
 def _outlines(collection: Any) -> Iterator[np.ndarray]:
@@ -135,7 +131,8 @@ def _along(points: np.ndarray) -> np.ndarray:
         return points
     steps = np.linspace(0, 1, -(-_FINE // len(points)), endpoint=False)[:, None, None]
     between = (points[:-1] + steps * (points[1:] - points[:-1])).reshape(-1, 2)
-    return between[np.isfinite(between).all(1)]
+    found: np.ndarray = between[np.isfinite(between).all(1)]
+    return found
 
 
 def _lengthen(axes: Axes, share: float) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -68,8 +68,8 @@ def draw_loop(picture: LoopPicture, width: object = None, font: object = None) -
         other = [None] * 3 if picture.beside is None else [each[:, thinned] for each in picture.beside]
         for name, entries in states:
             axes = next(left)
-            values = [_of(part, entries) for part in (picture.state[:, thinned], other[0])]
-            _vector(axes, time, *values, "x", entries, many=len(picture.state_units) > 1)
+            values, beside = picture.state[:, thinned][..., entries], _of(other[0], entries)
+            _vector(axes, time, values, beside, "x", entries, many=len(picture.state_units) > 1)
             if picture.wanted is not None:
                 for k, entry in enumerate(entries):
                     line = picture.wanted[thinned, entry]
@@ -78,8 +78,8 @@ def draw_loop(picture: LoopPicture, width: object = None, font: object = None) -
             titles.append("")
         for name, entries in inputs:
             axes = next(left)
-            values = [_of(part, entries) for part in (picture.control[:, thinned], other[1])]
-            _vector(axes, time, *values, "u", entries, many=len(picture.input_units) > 1, held=True)
+            values, beside = picture.control[:, thinned][..., entries], _of(other[1], entries)
+            _vector(axes, time, values, beside, "u", entries, many=len(picture.input_units) > 1, held=True)
             titles.append(bounds(axes, picture.low[entries], picture.high[entries]))
             axes.set_ylabel(name)
         axes = next(left)
@@ -107,7 +107,7 @@ def _column(values: np.ndarray | None) -> np.ndarray | None:
 def _vector(
     axes: Axes,
     time: np.ndarray,
-    values: np.ndarray | None,
+    values: np.ndarray,
     beside: np.ndarray | None,
     letter: str,
     entries: Sequence[int],
@@ -115,12 +115,11 @@ def _vector(
     held: bool = False,
 ) -> None:
     """Draw entries (R, T, k) of all rows, those of the other loop behind; as steps where they are held."""
-    steps = {"drawstyle": "steps-post"} if held else {}
-    assert values is not None
-    for k in range(len(entries)) if beside is not None else ():
-        for row in beside[::-1, :, k]:
-            axes.plot(time, row, color="0.7", linewidth=2.4, solid_capstyle="butt", **steps)
+    steps: dict[str, Any] = {"drawstyle": "steps-post"} if held else {}
     if beside is not None:
+        broad: dict[str, Any] = {"color": "0.7", "linewidth": 2.4, "solid_capstyle": "butt", **steps}
+        for row in beside:
+            axes.plot(time, row, **broad)
         axes.get_lines()[-1].set_label("LQR")
     for k, entry in enumerate(entries):
         look = {"linestyle": dash(k), "color": colour(k), **steps}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -221,7 +221,7 @@ def _errors(axes: Axes, panel: ErrorPanel) -> None:
         failed = radius[~np.isfinite(error)]
         if len(failed):  # one row of marks a method, so that two that fail together are both seen
             at = np.full(len(failed), _FAILED * 4.0**i)
-            marks = {"markersize": 3, "color": colour(i), "linestyle": "none", "marker": "x"}
+            marks: dict[str, Any] = {"markersize": 3, "color": colour(i), "linestyle": "none", "marker": "x"}
             axes.plot(failed, at, label="fails (in its colour)", **marks)
     rounding = axes.axhline(panel.rounding, color="0.4", linewidth=0.8, linestyle=(0, (1, 1)))
     rounding.set_label(r"$\varepsilon$ of the dtype")

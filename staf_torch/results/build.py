@@ -7,11 +7,13 @@ is imported to be looked at.
 from __future__ import annotations
 
 import ast
+import contextlib
 import functools
 import hashlib
 import importlib.metadata
 import json
 import os
+import platform
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -72,6 +74,21 @@ def build(settings: Mapping[str, Any], compiler: str) -> dict[str, Any]:
         "compiler": compiler,
         "modules": modules(settings),
     }
+
+
+@functools.cache
+def machine() -> str:
+    """Return a machine in a few words: `AMD EPYC 9V84, 2 CPUs, Linux`."""
+    return f"{processor()}, {os.cpu_count()} CPUs, {platform.system()}"
+
+
+def processor() -> str:
+    """Return the name of the processor."""
+    with contextlib.suppress(OSError), open("/proc/cpuinfo", encoding="utf-8") as lines:
+        for line in lines:
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
 
 
 def modules(settings: Mapping[str, Any]) -> dict[str, str]:

@@ -194,7 +194,13 @@ def _of_record(directory: Path, record: Mapping[str, Any]) -> RecordedRun:
         declared=read_infos(record.get("metrics")),
         lost=lost,
         build=short(made_by) if isinstance(made_by, dict) else None,
+        **{name: _text(record.get(name)) for name in ("began", "machine", "python")},  # type: ignore[arg-type]
+        units={str(key): str(text) for key, text in _table(record.get("units")).items()},
     )
+
+
+def _table(value: Any) -> dict[Any, Any]:
+    return value if isinstance(value, dict) else {}
 
 
 def _status(record: Mapping[str, Any]) -> tuple[str, str | None]:

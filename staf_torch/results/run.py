@@ -46,6 +46,10 @@ class RecordedRun:
     declared: Mapping[str, MetricInfo] = dataclasses.field(default_factory=dict)  # of the user's own metrics
     lost: Mapping[str, str] = dataclasses.field(default_factory=dict)  # metric -> what stood there instead
     build: str | None = None  # what else made the numbers: source, torch, compiler, own modules
+    began: str | None = None  # date and time, ISO 8601, UTC
+    machine: str | None = None
+    python: str | None = None  # its version
+    units: Mapping[str, str] = dataclasses.field(default_factory=dict)  # of the plant: state, input
 
     def __repr__(self) -> str:
         """`<Run completed: kernel=gaussian, ball_error=0.0762>`: overrides and the first headlines."""

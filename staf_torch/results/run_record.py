@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import logging
+import platform
 import re
 import time
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -15,7 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from .._version import __version__
 from ..numerics import COMMAND_LINE, fail
-from .build import build, checksums, damaged, differences, imported, record_checksum
+from .build import build, checksums, damaged, differences, imported, machine, record_checksum
 from .files import COMPLETED, METRICS, ROWS, flatten, plain, write_text
 from .files import RUN as RUN
 from .files import SWEEP as SWEEP
@@ -51,7 +53,13 @@ class RunRecord:
             "settings": settings,
             "build": build(settings, compiler),
         }
-
+        # What no run is told apart by: when and where it ran, and the units of its plant.
+        self._facts: dict[str, Any] = {
+            "began": datetime.now(UTC).isoformat(timespec="seconds"),
+            "machine": machine(),
+            "python": platform.python_version(),
+            "units": {},
+        }
         self._files: tuple[str, ...] = ("**/*",)
         self._cfg = cfg
 
@@ -69,6 +77,10 @@ class RunRecord:
         if metrics:
             self._about["metrics"] = {info.name: info.record() for info in metrics}
 
+    def measured_in(self, units: Mapping[str, str]) -> None:
+        """Add the units of the plant: of its state and its input, where it declares them."""
+        self._facts["units"] = dict(units)
+
     def add_seconds(self, seconds: float) -> None:
         """Count time that was spent on the run before it began: its share of a tensor batch."""
         self._start -= seconds
@@ -76,7 +88,7 @@ class RunRecord:
     def write(self, directory: Path, status: str, reason: str | None = None) -> None:
         """Write the record with a status: running, completed or failed."""
         spent = round(time.monotonic() - self._start, 3)
-        record = {**self._about, "status": status, "reason": reason, "seconds": spent}
+        record = {**self._about, **self._facts, "status": status, "reason": reason, "seconds": spent}
         if status == COMPLETED:
             made_by = self._about["build"]
             further = imported(made_by["modules"])  # as the run has ended: it imported them on its way

@@ -35,7 +35,7 @@ from ..metrics import Metric
 from ..numerics.checks import COMMAND_LINE, choice, fail, flag, integer, positive_real, real, vector
 from ..optim import UpdateLaw
 from ..results.metric_info import OWN
-from ..systems import ControlAffineSystem, simulate
+from ..systems import ControlAffineSystem, Units, simulate
 from .plain import PlainSettings
 from .plain import plain as plain
 
@@ -218,6 +218,16 @@ def make_system(cfg: DictConfig | PlainSettings) -> Any:
     """Build the plant that the settings name: by its class, or by a function of nothing that makes it."""
     made = make(cfg)
     return made() if inspect.isfunction(made) else made
+
+
+def units_of(cfg: DictConfig | PlainSettings) -> dict[str, str]:
+    """Return the units of state and input that the class of the plant declares; nothing where it has none."""
+    chosen = cfg.get("system") or {}
+    try:
+        units = getattr(get_object(str(chosen.get("path") or chosen.get("_target_"))), "units", Units())
+    except Exception:  # the run itself says what is wrong with its plant
+        return {}
+    return units._asdict() if isinstance(units, Units) and units != Units() else {}
 
 
 def make_metrics(cfg: DictConfig | PlainSettings | None) -> tuple[Metric, ...]:

@@ -20,6 +20,9 @@ def without_setting(name: str) -> str:
     if choices := known.get(name):
         shown = ", ".join(choices[:4]) + (", ..." if len(choices) > 4 else "")
         return f"there is no setting `{name}` with what is chosen; {shown} has it."
+    if name in known:
+        whole = name.partition(".")[0]
+        return f"`{name}` cannot be set where `{whole}` is one value: leave `{whole}=...` away."
     near = difflib.get_close_matches(name, known, n=1)
     return f"there is no setting `{name}`; " + (
         f"did you mean `{near[0]}`?" if near else "`staf --help` lists them."

@@ -23,7 +23,7 @@ from ..numerics.checks import COMMAND_LINE, choice
 from ..results import run_record as records
 from ..results.files import METRICS
 from ..results.progress import SHOWN, Progress
-from ..settings.chase import make_metrics
+from ..settings.chase import make_metrics, units_of
 from . import lock
 from .batching import DEFERRED, USER_ERRORS, Outcome, completion, reason, sentence
 from .hydra_compat import as_typed
@@ -73,6 +73,7 @@ def execute(
                 _log.info("replaces the run of the same command line in %s", os.path.relpath(directory))
             with recorded(record, directory, seconds):
                 record.declare([metric.info for metric in make_metrics(cfg.get("metric"))])
+                record.measured_in(units_of(cfg))
                 metrics = completion(cfg, outcome)(cfg, directory, progress)
             _log.info("  run directory: %s", os.path.relpath(directory))
     except BaseException as error:

@@ -7,19 +7,21 @@ import dataclasses
 import importlib.resources
 import itertools
 import logging
+import shlex
 from array import array
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
 
 from ..figures.style import images
 from ..figures.sweep import SEED, SWEEP_FIGURES
-from ..results.files import COMPLETED, PAGE, ROWS, TABLE, parse_overrides
+from ..results.files import COMPLETED, PAGE, ROWS, SWEEP, TABLE, parse_overrides
 from ..results.reader import Collection, Value, collect, identity, read_record, read_rows
 from ..results.run import as_text
 from ..results.run_directory import RunDirectory
+from ..results.run_record import read
 from ..tables import Layout, Style, Table, latex_text, tabulate
 from ..tables.columns import PrintedColumn, show
 
@@ -55,7 +57,8 @@ def write_report(directory: Path, *, figures: bool = True) -> str:
     text = out.table(TABLE, tabulate(found, Layout(every_metric=True)), shown=table)
     out.text(f"{TABLE}.tex", latex_text(table))
     drawn = draw_sweep(found, out) if figures else {}
-    out.text(PAGE, page(found, table, drawn, f"Sweep {directory.resolve().name}"))
+    title = f"Sweep {directory.resolve().name}"
+    out.text(PAGE, page(found, table, drawn, title, facts=facts(directory, found)))
     return text
 
 
@@ -91,8 +94,36 @@ def _write_spread(directory: Path, out: RunDirectory) -> str:
     found = Collection((dataclasses.replace(base, settings=kept),), ())
     text = f"{table.markdown()}\n{shown}\n"
     out.text(f"{TABLE}.md", text)
-    out.text(PAGE, page(found, table, {}, f"Sweep {directory.resolve().name}", shown))
+    title = f"Sweep {directory.resolve().name}"
+    out.text(PAGE, page(found, table, {}, title, shown, facts(directory, found)))
     return text
+
+
+def facts(directory: Path, found: Collection) -> dict[str, str]:
+    """Return what makes runs repeatable: command, date, machine, versions, and the units of the plant."""
+    sweep = read(directory / SWEEP) or {}
+    typed = [part for name in ("overrides", "hydra") if isinstance(part := sweep.get(name), list)]
+    words = [str(word) for part in typed for word in part]
+    began = sorted(run.began for run in found.rows if run.began)
+    builds = _all(run.build for run in found.rows) or _all(run.version for run in found.rows)
+    python = _all(run.python for run in found.rows)
+    told = {
+        "command": f"staf -m {shlex.join(words)}" if words else "",
+        "date": " to ".join(dict.fromkeys([*began[:1], *began[-1:]])),
+        "machine": _all(run.machine for run in found.rows),
+        "versions": ", ".join(
+            filter(None, [builds and f"staf_torch {builds}", python and f"Python {python}"])
+        ),
+        "units": _all(", ".join(f"{name} {unit}" for name, unit in run.units.items()) for run in found.rows),
+    }
+    return {
+        name: text or ("none declared" if name == "units" else "not recorded") for name, text in told.items()
+    }
+
+
+def _all(texts: Iterable[str | None]) -> str:
+    """Return the texts that there are, each once."""
+    return "; ".join(dict.fromkeys(text for text in texts if text))
 
 
 def draw_sweep(found: Collection, out: RunDirectory) -> dict[str, bytes]:
@@ -115,7 +146,12 @@ def draw_sweep(found: Collection, out: RunDirectory) -> dict[str, bytes]:
 
 
 def page(
-    found: Collection, table: Table, figures: Mapping[str, bytes], title: str, about: str | None = None
+    found: Collection,
+    table: Table,
+    figures: Mapping[str, bytes],
+    title: str,
+    about: str | None = None,
+    facts: Mapping[str, str] | None = None,
 ) -> str:
     """Return `report.html`: one file without links with the table, the figures and the settings.
 
@@ -125,6 +161,7 @@ def page(
         figures: what each shows, and its PNG.
         title: heading of the page.
         about: the line below it; None: how many runs of what there are.
+        facts: of `facts`.
     """
     import jinja2  # the callbacks of every run import this module
 
@@ -138,7 +175,8 @@ def page(
         title=title,
         about=about or _about(found),
         notes=[*table.notes, *skipped, *found.remarks],
-        headings=[_heading(column) for column in columns],
+        facts=facts or {},
+        headings=[_heading(column, found) for column in columns],
         rows=[[_cell(column, row) for column in columns] for row in range(len(table.rows))],
         figures={what: base64.b64encode(png).decode() for what, png in figures.items()},
         settings={key: as_text(value) for key, value in _common(found).items()},
@@ -165,8 +203,10 @@ def _common(found: Collection) -> dict[str, Value]:
     }
 
 
-def _heading(column: PrintedColumn) -> dict[str, str]:
+def _heading(column: PrintedColumn, found: Collection) -> dict[str, str]:
     text = ", ".join(filter(None, (column.over, column.heading)))
+    unit = found.infos[column.name].unit if column.metric and column.name in found.infos else ""
+    text = text if unit in ("", "1") else f"{text} ({unit})"
     return {"text": text, "kind": "number" if column.numeric else "text"}
 
 

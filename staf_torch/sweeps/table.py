@@ -26,7 +26,7 @@ from ..results.files import ROWS, open_after, partial_name
 from ..results.progress import Progress
 from ..results.run_directory import RunDirectory
 from ..results.untrusted import UnreadableError, parse_object, read_lines
-from ..settings.chase import make_metrics
+from ..settings.chase import make_metrics, units_of
 from ..settings.plain import ManySettings
 from . import workers
 from .batching import Computed, Failed, Outcome, Written, completion, reason
@@ -108,6 +108,7 @@ def fill(
     ):
         check_animation(jobs.base)
         record.declare([metric.info for metric in make_metrics(jobs.base.get("metric"))])
+        record.measured_in(units_of(jobs.base))
         for row in _rows(directory / partial_name(ROWS), done):
             ended(row["num"], row["reason"])
         for begin in range(done // piece * piece, len(overrides), piece):

@@ -40,7 +40,7 @@ SYMBOLS: Mapping[str, tuple[str, str]] = {
     "ball_floor_error": (r"$\sup |V - V^\ast|$", "largest error in the ball with ideal weights"),
     "gradient_error": (r"$\sup |\nabla V - \nabla \hat V|$", "largest error of the gradient"),
     "condition_number": (r"$\kappa$", "condition number of the Gram matrix"),
-    "settling_time": ("$t_s$/s", "settling time"),
+    "settling_time": ("$t_s$/s", "time from which the excess is at most its ultimate value"),
     "cost": ("$J$", "cost"),
     "optimal_cost": (r"$J^\ast$", "optimal cost"),
     "cost_ratio": (r"$J/J^\ast$", "cost over the optimal one"),

@@ -138,9 +138,10 @@ def escaped(text: str) -> str:
 
 
 def json_text(table: Table) -> str:
-    """``{"columns": [...], "rows": [{"ball_error": null, "reasons": {"ball_error": "..."}}], "notes": []}``.
+    """Return ``[{"ball_error": null, "reasons": {"ball_error": "..."}}, ...]``: `pandas.read_json` reads it.
 
-    NaN and infinity, which JSON does not have, are null with the reason.
+    Every row has every column, and the reasons of what is missing. NaN and infinity, which JSON does not
+    have, are null with the reason.
 
     Example:
         >>> done = sweep("centers.radius=0.1,0.2", "duration=0.1", "settle_time=0", "figures=false")
@@ -149,14 +150,14 @@ def json_text(table: Table) -> str:
 
         Shown by `staf-table runs --format json`.
     """
-    content = {"columns": table.names, "rows": [*map(_json_row, table.rows)], "notes": table.notes}
+    content = [_json_row(table.names, row) for row in table.rows]
     return dumps(content, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
 
 
-def _json_row(row: Row) -> dict[str, Any]:
+def _json_row(names: Sequence[str], row: Row) -> dict[str, Any]:
     lost = {n: v for n, v in row.cells.items() if isinstance(v, float) and not math.isfinite(v)}
     reasons = {**row.reasons, **{name: f"{value!r} is not a JSON number" for name, value in lost.items()}}
-    return {**row.cells, **dict.fromkeys(lost), "reasons": reasons}
+    return {**dict.fromkeys(names), **row.cells, **dict.fromkeys(lost), "reasons": reasons}
 
 
 def parquet_bytes(table: Table) -> bytes:

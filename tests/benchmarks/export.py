@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from staf_torch import ExponentialKernel, StaF, StaFBasis, StateFollowingCenters, deploy, rings, targets
-from staf_torch.deploy.sheet import latency, machine
+from staf_torch.deploy.sheet import latency
+from staf_torch.results.build import processor
 
 STATE = torch.tensor([1.0, 0.3], dtype=torch.float64)
 NAMES = ["value", "gradient"]
@@ -69,7 +70,7 @@ def runners(folder: Path, dtype: torch.dtype, y: Tensor) -> dict[str, Callable[[
 def main() -> None:
     folder = Path(sys.argv[1])
     folder.mkdir(parents=True, exist_ok=True)
-    print(f"{machine()}, torch {torch.__version__}, onnxruntime {onnxruntime.__version__}")
+    print(f"{processor()}, torch {torch.__version__}, onnxruntime {onnxruntime.__version__}")
     for dtype in (torch.float32, torch.float64):
         y = (STATE + 0.03)[None].to(dtype)
         for name, run in runners(folder, dtype, y).items():

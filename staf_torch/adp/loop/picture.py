@@ -60,14 +60,12 @@ class LoopAbout:
             run: the loop of another controller, from other states.
         """
         bounds, clock = cost.bounds, isinstance(system, Clocked)
-        limits = (None, None) if bounds is None else (bounds.low, bounds.high)
+        low, high = (None, None) if bounds is None else (bounds.low, bounds.high)
         itself = isinstance(controller, Feedback) and isinstance(controller.policy, LQR)
         plant = type(system.plant if isinstance(system, Clocked) else system).__name__
-        return cls(
-            *(plant, controller.label, system.units, system.periodic, clock, *limits),
-            cost=cost,
-            beside=None if itself else lambda x0: run(Feedback(LQR(system, cost, period)), x0),
-        )
+        beside = None if itself else lambda x0: run(Feedback(LQR(system, cost, period)), x0)
+        facts = plant, controller.label, system.units, system.periodic, clock, low, high
+        return cls(*facts, cost, beside)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "cost": None, "beside": None}
@@ -123,7 +121,8 @@ def _far(result: LoopResult) -> Tensor | None:
     about = result.about
     if about is None or about.cost is None:
         return None
-    return about.cost.deviation(result.state[:, -1]).norm(dim=-1)
+    far: Tensor = about.cost.deviation(result.state[:, -1]).norm(dim=-1)
+    return far
 
 
 def picture(result: LoopResult, rows: Sequence[int] | None, lqr: bool) -> LoopPicture:

@@ -142,7 +142,8 @@ class LoopResult:
         """The results of so many rows each, in their order."""
         leaves, structure = flatten([getattr(self, name) for name in _OF_ROWS])
         parts = zip(*(leaf.split(rows) for leaf in leaves), strict=True)
-        return [LoopResult(self.time, *unflatten(structure, iter(part)), self.about) for part in parts]
+        found = (LoopResult(self.time, *unflatten(structure, iter(part))) for part in parts)
+        return [dataclasses.replace(part, about=self.about) for part in found]
 
 
 _OF_ROWS = ("state", "control", "running_cost", "recorded", "frozen_at", "carried")
@@ -332,7 +333,7 @@ class _LoopRun:
         new = flatten([getattr(other, name) for name in _OF_ROWS])[0]
         pairs = zip(kept, new, strict=True)
         mixed = [old.index_copy(0, rows, fresh if alone else fresh[rows]) for old, fresh in pairs]
-        return LoopResult(result.time, *unflatten(structure, iter(mixed)), result.about)
+        return LoopResult(result.time, *unflatten(structure, iter(mixed)))
 
 
 def _run(
