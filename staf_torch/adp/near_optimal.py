@@ -15,6 +15,7 @@ from ..approximation.basis import StaFBasis
 from ..centers import StateFollowingCenters, cross_polytope
 from ..kernels import ExponentialKernel
 from ..lanes import ready, where_rows
+from ..lanes.opaque import opaque
 from ..numerics.checks import choice, flag, positive_real
 from ..systems import Plant
 from ..systems.bounds import Limit
@@ -83,6 +84,7 @@ class NearOptimal(SampledRollout):
         """Planner of the policy as a function of x; None where it does not plan."""
         return self.plans() if self.plan and self.memory is None else None
 
+    @opaque
     def forward(self, x: Tensor) -> Tensor:
         """u: (..., n) -> (..., m)."""
         if self.memory is not None:
@@ -233,6 +235,7 @@ class NearOptimal(SampledRollout):
         return statistics.median_high(taken[len(taken) // 2 :])  # the first ones warm the caches
 
 
+@opaque
 def near_optimal(
     plant: Plant,
     cost: Cost,

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ..approximation.basis import StaFBasis, Target
 from ..lanes import Program
+from ..lanes.opaque import opaque
 from ..optim.base import UpdateLaw
 from . import row_program
 from .certificate import before_each, certify, first_link
@@ -21,6 +22,7 @@ from .result import ChaseResult, ChaseWeights, concatenate
 _WORKING_BYTES = 2**26
 
 
+@opaque
 def chase(
     states: Tensor,
     basis: StaFBasis,
@@ -98,6 +100,7 @@ def chase_pieces(
         yield run.results(states)
 
 
+@opaque
 def chase_weights(
     states: Tensor | Iterable[Tensor],
     basis: StaFBasis,
@@ -194,7 +197,7 @@ class _ChaseRun:
             recorded = self._compiled(self._program, states, 1 if history else states.shape[1]).weights
             assert recorded is not None
             return recorded
-        self._warned = self._warned or self._problem.basis.check_reach(states, stacklevel=4)
+        self._warned = self._warned or self._problem.basis.check_reach(states, stacklevel=5)
         known = know(self._problem, states, local=bool(self._problem.law.needs))
         run, _ = self._corrected(known)
         return run.after * (-kept_gain(known.log_gain, run.carry)).exp().unsqueeze(-1)
@@ -211,7 +214,7 @@ class _ChaseRun:
             return with_certificate(
                 result, found.certificate, torch.zeros_like(result.value, dtype=torch.bool)
             )
-        self._warned = self._warned or problem.basis.check_reach(states, stacklevel=4)
+        self._warned = self._warned or problem.basis.check_reach(states, stacklevel=5)
         known, link = know(problem, states, local=True), self.carry.link
         run, inputs = self._corrected(known)
         gone = lost(run.carry, states.shape[1])
@@ -264,6 +267,6 @@ class _ChaseRun:
         self.carry = after.chase._replace(time=start + states.shape[1], diverged_at=diverged_at)
         self._unit = after.unit
         if not self._warned:
-            self._warned = self._problem.basis.warn_reach(float(after.reach.max()), stacklevel=5)
+            self._warned = self._problem.basis.warn_reach(float(after.reach.max()), stacklevel=6)
         found: row_program.Outputs = outputs
         return found

@@ -23,6 +23,7 @@ from .call import PlannedCall, ordinary
 from .contents import BOUND, Contents
 from .locks import Mutex
 from .loops import tracing_now
+from .opaque import opaque
 from .plain_time import PlainTime
 from .program import Program
 from .shared_programs import shared_program
@@ -165,6 +166,7 @@ class CompiledMethod:
     def __call__(self, x: Tensor, /) -> Tensor: ...
     @overload
     def __call__(self, x: Tensor, first: Tree, /, *more: Tree) -> Any: ...
+    @opaque
     def __call__(self, x: Tensor, /, *more: Tree) -> Any:
         """y: (..., n) -> (..., m), or trees of (B, ...)."""
         if not ordinary(flatten((x, *more))[0] if more else (x,)) or x.numel() == 0 or tracing_now():

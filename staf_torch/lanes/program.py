@@ -18,6 +18,7 @@ from .emit.c import Names, c_text
 from .emit.cpp import emit
 from .locks import Mutex
 from .loops import scan, tracing_now
+from .opaque import opaque
 from .row_independence import doubt, undrawn
 from .trace.step import Step, trace
 from .trace.tracer import NotLoweredError
@@ -114,6 +115,7 @@ class Program(Derived):
         program._of_users, program._asked, program._refused = self._of_users, self._asked, self._refused
         return program
 
+    @opaque
     def __call__(
         self, carry: Tree, now: Tree = (), row: Tree = (), *, steps: int | None = None, every: int = 1
     ) -> tuple[Tree, Tree]:
@@ -381,6 +383,7 @@ class Prepared:
         self.plan: PlannedCall | None = None
         self._refused = given.rows == 0 or given.times == 0
 
+    @opaque
     def __call__(self, carry: Tree, now: Tree = (), row: Tree = ()) -> tuple[Tree, Tree]:
         """The carry after the last step, and the outputs."""
         leaves, structure = flatten((row, now, carry))

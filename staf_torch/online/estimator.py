@@ -17,6 +17,7 @@ from torch import Tensor
 
 from ..kernels import NAMED, Kernel
 from ..lanes.locks import ReadWriteLock
+from ..lanes.opaque import opaque
 from ..numerics.checks import choice, fail, integer
 from .compiled_filter import DirectCalls
 from .samples import in_place, lapse_of, lapses, like_given, pair, tensor_of
@@ -193,6 +194,7 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
     def _decisive(self) -> tuple[str, ...]:
         """Return the names of the arguments that what was learned depends on."""
 
+    @opaque
     def fit(self, x: Any, y: Any, time: Any = None) -> Self:
         """Start afresh and learn from samples in the order of time.
 
@@ -224,6 +226,7 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
             self._take_extra(state)
         vars(self).update({name: value for name, value in vars(twin).items() if name.endswith("_")})
 
+    @opaque
     def partial_fit(self, x: Any, y: Any, lapse: Any = None) -> Self:
         """Learn from one sample a stream.
 
@@ -266,6 +269,7 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
             raise self._refusal("partial_fit", states, values)
         streams.learn(rows, targets, None if lapse is None else lapse.expand(streams.count).contiguous())
 
+    @opaque
     def predict(self, x: Any, return_std: bool = False) -> Any:
         """Predict the next y at x, before it is learned.
 

@@ -12,6 +12,7 @@ from torch import Tensor
 from ..lanes import Program, repeat, shared_program
 from ..lanes.compiled_methods import undecided, worth
 from ..lanes.loop_program import LoopProgram
+from ..lanes.opaque import opaque
 from ..lanes.tree import Tree
 from ..numerics.checks import integer, positive_real, trailing
 from ..numerics.exponential_step import BENT, GRACE, MOST, TOLERANCE, TRIED, needed_steps
@@ -161,6 +162,7 @@ def _refined(
     return after, piece
 
 
+@opaque
 def simulate(system: ControlAffineSystem, x0: Tensor, *, dt: float, steps: int) -> Tensor:
     """The whole of `trajectory` at once: (B, n) -> (B, steps + 1, n).
 

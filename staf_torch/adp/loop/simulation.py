@@ -16,6 +16,7 @@ from ...approximation.basis import StaFBasis
 from ...lanes import Program
 from ...lanes.compiled_methods import undecided, worth
 from ...lanes.loop_program import LoopProgram
+from ...lanes.opaque import opaque
 from ...lanes.tree import flatten, unflatten
 from ...numerics.angles import wrap
 from ...numerics.checks import choice, copied, fail, integer, positive_real, trailing
@@ -149,6 +150,7 @@ class LoopResult:
 _OF_ROWS = ("state", "control", "running_cost", "recorded", "frozen_at", "carried")
 
 
+@opaque
 def simulate(
     controller: Controller | Policy,
     system: Plant,
