@@ -15,6 +15,7 @@ from ..approximation.basis import StaFBasis
 from ..centers import StateFollowingCenters, cross_polytope
 from ..kernels import ExponentialKernel
 from ..lanes import ready, where_rows
+from ..lanes.gradients import marked, refuse_gradient, without_gradient
 from ..lanes.opaque import opaque
 from ..numerics.checks import choice, flag, positive_real
 from ..systems import Plant
@@ -87,6 +88,12 @@ class NearOptimal(SampledRollout):
     @opaque
     def forward(self, x: Tensor) -> Tensor:
         """u: (..., n) -> (..., m)."""
+        if self.plan:  # without plans it has a derivative with respect to x
+            refuse_gradient("near_optimal(plan=True)", x=x)
+        if self.lqr.layers and torch.is_grad_enabled() and not x.requires_grad:
+            with torch.no_grad():
+                u: Tensor = self(x)
+            return marked("near_optimal", self.lqr.layers, u)
         if self.memory is not None:
             return self.memory(x.double()).to(x)  # type: ignore[no-any-return]
         u, planner = super().forward(x), self.planner
@@ -236,6 +243,7 @@ class NearOptimal(SampledRollout):
 
 
 @opaque
+@without_gradient("adp.near_optimal", "plant", "cost")
 def near_optimal(
     plant: Plant,
     cost: Cost,

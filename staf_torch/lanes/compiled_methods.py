@@ -175,14 +175,17 @@ class CompiledMethod:
             rows = x.numel() / x.shape[-1]
             if not self._pays(rows):
                 return self._counted(rows, x, *more)
-        if self._read is None or not self._read.unchanged(library=False):
-            self._compile(trees=bool(more))
+        read = self._read
+        if self._served is None or read is None or not read.unchanged(library=False):
+            read = self._compile(trees=bool(more))
+        served = self._served
+        if served is None or read.wants_gradient():  # of what the owner holds
+            return self.definition(x, *more)
         self.waits = False
-        assert self._served is not None
         if more:
-            return self._served(x, *more)
+            return served(x, *more)
         dims = x.dim()
-        y = self._served(x if dims <= 2 else x.reshape(-1, x.shape[-1]))
+        y = served(x if dims <= 2 else x.reshape(-1, x.shape[-1]))
         return y.view(-1) if dims == 1 else y.reshape(*x.shape[:-1], y.shape[-1])
 
     def _pays(self, rows: float) -> bool:
@@ -223,20 +226,23 @@ class CompiledMethod:
         """Compile at the next call, whatever it pays."""
         self._asked, self.waits = math.inf, True
 
-    def _compile(self, trees: bool) -> None:
+    def _compile(self, trees: bool) -> Contents:
+        """Make what serves, unless a gradient by something that the owner holds is wanted now."""
         with self._lock:
-            if self._read is not None and self._read.unchanged(library=False):
-                return  # another thread has
+            if self._served is not None and self._read is not None and self._read.unchanged(library=False):
+                return self._read  # another thread has
             settings, read = self._settings, Contents(self.definition, self.owner)
             read.warn(settings.name)
-            served: Served
-            if settings.by is not None:
-                served = settings.by(self.owner)
-            else:
-                made = self.definition, settings.name, self.definition, self.owner
-                rows = Rows(*made, copies=settings.copies)
-                served = _Trees(rows) if trees else rows
+            served: Served | None = None
+            if not read.wants_gradient():
+                if settings.by is not None:
+                    served = settings.by(self.owner)
+                else:
+                    made = self.definition, settings.name, self.definition, self.owner
+                    rows = Rows(*made, copies=settings.copies)
+                    served = _Trees(rows) if trees else rows
             self._served, self._read = served, read
+            return read
 
 
 def ready(module: nn.Module, x: Tensor) -> bool:

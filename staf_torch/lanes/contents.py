@@ -103,7 +103,7 @@ class Contents:
     """
 
     def __init__(self, *objects: Any) -> None:
-        walk = self._walk = _Walk(io.BytesIO())
+        walk = self._walk = Walk(io.BytesIO())
         self.key: tuple[bytes, tuple[object, ...]] | None = None
         try:
             for each in objects:
@@ -134,6 +134,10 @@ class Contents:
         self._views = [*(part.values() for part in (*walk.dicts, *self._users)), *walk.lists]
         self._lengths, self._inside = [*map(len, self._sized)], [*self._look()]
         self._methods = self.methods()
+
+    def wants_gradient(self) -> bool:
+        """Return whether autograd is on, and one of the tensors requires a gradient."""
+        return torch.is_grad_enabled() and True in [tensor.requires_grad for tensor in self.tensors]
 
     def warn(self, name: str) -> None:
         """Log, once, what cannot be watched."""
@@ -203,6 +207,12 @@ class Contents:
                 (part.__code__, part.__defaults__) for part in walk.functions
             )  # an editor may reload them
         return chain.from_iterable([*self._views, *parts])
+
+
+def _is_layer(kind: type) -> bool:
+    """Return whether a class makes parameters by itself, which require gradients by default."""
+    root, _, rest = kind.__module__.partition(".")
+    return kind is not nn.Module and (root == "torch" or (root == _PACKAGE and rest.startswith("approximation")))
 
 
 class _Same:
@@ -279,7 +289,7 @@ def _content_of(cell: CellType) -> Any:
         return _EMPTY
 
 
-class _Walk(pickle.Pickler):
+class Walk(pickle.Pickler):
     """Writes everything but floating-point tensors, and notes what may change later."""
 
     def __init__(self, file: io.BytesIO) -> None:
@@ -299,10 +309,20 @@ class _Walk(pickle.Pickler):
         self.functions: list[FunctionType] = []
         self.of_users = False
         self.unwatched: str | None = None
+        self.layers: set[int] = set()  # parameters that a layer of torch's, or of this library's, made
         self._states: dict[int, Any] = {}  # containers that are noted, or made on the way
         self._places: dict[int, int] = {}
         self._waiting: list[FunctionType | type] = []  # whose surroundings are to be written
         self._met: dict[int, int] = {}  # of a function or class of a user: its place among the kept
+
+    def noted(self, value: Any) -> None:
+        """Note the parameters and buffers of a module, where it cannot be written down."""
+        for part in value.modules() if isinstance(value, nn.Module) else ():
+            if any(map(_is_layer, type(part).__mro__)):
+                self.layers.update(map(id, part._parameters.values()))
+            for tensor in (*part._parameters.values(), *part._buffers.values()):
+                if tensor is not None:
+                    self.persistent_id(tensor)
 
     def finish(self) -> None:
         """Write what the functions and classes of a user read that were come upon, and so on."""
@@ -332,6 +352,8 @@ class _Walk(pickle.Pickler):
 
     def reducer_override(self, value: Any) -> Any:
         if isinstance(value, nn.Module):
+            if any(map(_is_layer, type(value).__mro__)):
+                self.layers.update(map(id, value._parameters.values()))
             state = {k: v for k, v in value.__getstate__().items() if k not in _IDLE and k != BOUND}
             # The keys of hooks count all hooks of the process.
             hooks = {k: tuple(v.values()) for k, v in state.items() if k.endswith("_hooks") and v}

@@ -274,6 +274,10 @@ class Program(Derived):
                 _say(self.name, f"its step {self._refused}")
         return self._refused is None
 
+    def differentiated(self) -> bool:
+        """Return whether a gradient by a tensor that the step found elsewhere is wanted."""
+        return self._read is not None and self._read.wants_gradient()
+
     def _look_around(self) -> None:
         """Forget what was compiled of a step that now reads something else."""
         read = self._read
@@ -393,7 +397,7 @@ class Prepared:
 
     def run(self, leaves: Sequence[Any], carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
         """Run with inputs that are known to fit."""
-        if self._refused or not ordinary(leaves):
+        if self._refused or not ordinary(leaves) or self._program.differentiated():
             return self._program.definition(carry, now, row, steps=self._steps, every=self._every)
         if self.plan is None:
             given = Given.of(carry, now, row, self._steps)

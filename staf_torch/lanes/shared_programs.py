@@ -69,7 +69,7 @@ class SharedPrograms:
         program, read, _ = self._latest.get(_identities(owners), (None, None, None))
         if read is None or read.reason is not None or not read.unchanged():
             return None
-        if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in read.tensors):
+        if read.wants_gradient():
             return None
         return program
 
@@ -93,7 +93,7 @@ class SharedPrograms:
             new.described(None, ())
             return new
         tensors = read.tensors
-        if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
+        if read.wants_gradient():
             return Program(step, name=self._name, compile=False)
         versions = [*map(version, tensors)]
         with self._lock:

@@ -8,12 +8,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..lanes.gradients import refuse_gradient
 from ..numerics.checks import fail
 
 
 def tensor_of(call: str, name: str, value: Any) -> Tensor:
-    """A tensor as it is, without gradient; arrays and numbers as tensors; integers as float64."""
+    """A tensor as it is; arrays and numbers as tensors; integers as float64."""
     if isinstance(value, Tensor):
+        refuse_gradient(call, **{name: value})
         found = value.detach()
     else:
         try:

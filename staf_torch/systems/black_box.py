@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..lanes.gradients import refuse_gradient
 from ..numerics.differences import Apart, central_slopes
 from .base import Linearisation
 from .numpy_in_torch import InTorch, agrees
@@ -159,6 +160,7 @@ class BlackBox:
             return False
 
     def _numpy(self, x: Tensor, u: Tensor) -> Tensor:
+        refuse_gradient(f"{self._call} of a function without derivatives", x=x, u=u)
         if self._tensors:
             found: Tensor = self._function(x.detach(), u.detach())
             return found

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ..lanes.gradients import refuse_gradient
 from ..numerics.differences import central_slopes
 from .base import Plant
 
@@ -107,6 +108,7 @@ def find_equilibrium(
     Raises:
         ValueError: if there is none near the guess; the message says which coordinate keeps moving.
     """
+    refuse_gradient("find_equilibrium", plant=plant, x=x, u=u)
     x = torch.as_tensor(x, dtype=torch.float64)
     u = plant.resting_input() if u is None else torch.as_tensor(u, dtype=torch.float64)
     held = resting_input_at(plant, x, u)

@@ -15,10 +15,11 @@ from .bases import ValueBasis
 
 
 def value_gradient(value: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
-    """grad V, row by row, 0 where V is constant: (..., n) -> (..., n)."""
+    """grad V, row by row, 0 where V is constant: (..., n) -> (..., n). It has derivatives where x or V want any."""
+    learnt = torch.is_grad_enabled() and (x.requires_grad or value(x).requires_grad)
     with torch.enable_grad():
-        at = x.detach().requires_grad_()
-        return slope_of(value(at), at)
+        at = x if learnt and x.requires_grad else x.detach().requires_grad_()
+        return slope_of(value(at), at, create_graph=learnt)
 
 
 def hjb_residual(

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from ...lanes.contents import is_users, version
+from ...lanes.gradients import gradients_of, marked
 from ...numerics.checks import copied, real
 from ...numerics.linalg import riccati
 from ...systems import Plant
@@ -206,14 +207,17 @@ class LQR(nn.Module):
         cost: the cost, measured from the set-point of this plant.
         p: P, (n, n): e'Pe is the value of the linear plant.
         k: K, (m, n).
+        layers: tensors in the plant or the cost that require a gradient, as the parameters of networks do;
+            P and K have none with respect to them, and what is computed from them refuses to be asked for it.
 
     Raises:
-        ValueError: if the plant does not rest at the set-point under an input within the bounds, its
+        ValueError: if what the plant or the cost holds otherwise requires a gradient, the plant does not rest at the set-point under an input within the bounds, its
             linearisation cannot be stabilised, or the cost does not see a mode that does not decay.
     """
 
     def __init__(self, system: Plant, cost: Cost, period: float | None = None) -> None:
         super().__init__()
+        self.layers = gradients_of("LQR", system=system, cost=cost)
         self.cost = regulated("LQR", system, cost)
         self.period = system.period if period is None else period
         system, still = self.cost.regulated(system)
@@ -234,11 +238,13 @@ class LQR(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """u: (..., n) -> (..., m)."""
-        return self.cost.saturate(self.cost.input_of(-matvec(self.k, self.cost.deviation(x))))
+        u = self.cost.saturate(self.cost.input_of(-matvec(self.k, self.cost.deviation(x))))
+        return marked("LQR", self.layers, u) if self.layers else u
 
     def value(self, x: Tensor) -> Tensor:
         """e'Pe: (..., n) -> (...)."""
-        return quadratic(self.p, self.cost.deviation(x))
+        paid = quadratic(self.p, self.cost.deviation(x))
+        return marked("LQR", self.layers, paid) if self.layers else paid
 
 
 class Supervised(Controller):

@@ -15,6 +15,7 @@ from torch import Tensor
 from ...approximation.basis import StaFBasis
 from ...lanes import Program
 from ...lanes.compiled_methods import undecided, worth
+from ...lanes.gradients import without_gradient
 from ...lanes.loop_program import LoopProgram
 from ...lanes.opaque import opaque
 from ...lanes.tree import flatten, unflatten
@@ -151,6 +152,7 @@ _OF_ROWS = ("state", "control", "running_cost", "recorded", "frozen_at", "carrie
 
 
 @opaque
+@without_gradient("adp.simulate", "controller", "system", "cost", "x0")
 def simulate(
     controller: Controller | Policy,
     system: Plant,

@@ -17,6 +17,8 @@ import torch
 from torch import Tensor
 
 from ...lanes import Program, repeat, scan, traced_as
+from ...lanes.gradients import without_gradient
+from ...lanes.opaque import opaque
 from ...lanes.tree import Tree
 from ...numerics.box import minimum_and_slopes
 from ...numerics.checks import fail, integer, positive_real, trailing
@@ -97,6 +99,8 @@ class BoxDDP:
         self._back = Program(self.backward, name="a backward pass", compile=compile)
         self._forth = Program(self.forward, name="a forward pass", compile=compile)
 
+    @opaque
+    @without_gradient("BoxDDP.solve", "x0", "control", "reference", "terminal", "self")
     def solve(
         self,
         x0: Tensor,
@@ -136,29 +140,25 @@ class BoxDDP:
             reference = Reference(still, x0.new_zeros(*expected, n))
         ends: End = self.ends(x0) if terminal is None else terminal
         together = max(1, _NUMBERS // (self.steps * (n + 1) * (n + m) ** 2))
-        with torch.no_grad():
-            whole = x0, self.problem.admissible(control), *reference, *ends
-            if len(x0) <= together:
-                return self._solve(*whole)
-            parts = [
-                self._solve(*some) for some in zip(*(part.split(together) for part in whole), strict=True)
-            ]
+        whole = x0, self.problem.admissible(control), *reference, *ends
+        if len(x0) <= together:
+            return self._solve(*whole)
+        parts = [self._solve(*some) for some in zip(*(part.split(together) for part in whole), strict=True)]
         return Trajectories(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
     def _best_of_several(self, x0: Tensor, terminal: LocalModel | None) -> Trajectories:
         """The cheapest trajectories of the cheapest first controls of each row."""
         b, tried = len(x0), self.problem.admissible(first_controls(self.problem, self.steps))
-        with torch.no_grad():
-            ends = self.ends(x0) if terminal is None else terminal
-            still = x0.unsqueeze(1).expand(-1, self.steps, -1)
-            none = x0.new_zeros(*still.shape[:2], self.problem.inputs, x0.shape[1])
-            zero = x0.new_zeros(b, self.steps, self.problem.inputs), none, x0.new_ones(b, 1)
-            cost = torch.stack(
-                [
-                    self._followed(x0, (still, u.expand(b, -1, -1), *zero[:2]), zero[2], ends).cost
-                    for u in tried.to(x0)
-                ]
-            )
+        ends = self.ends(x0) if terminal is None else terminal
+        still = x0.unsqueeze(1).expand(-1, self.steps, -1)
+        none = x0.new_zeros(*still.shape[:2], self.problem.inputs, x0.shape[1])
+        zero = x0.new_zeros(b, self.steps, self.problem.inputs), none, x0.new_ones(b, 1)
+        cost = torch.stack(
+            [
+                self._followed(x0, (still, u.expand(b, -1, -1), *zero[:2]), zero[2], ends).cost
+                for u in tried.to(x0)
+            ]
+        )
         best = cost.argsort(dim=0, stable=True)[:_STARTS]  # (S, B)
         count = len(best)
         again = None if terminal is None else rows_of(terminal, torch.arange(b).repeat(count))

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from ...lanes import Program, scan
+from ...lanes.gradients import without_gradient
 from ...numerics.checks import fail, integer, positive_real, trailing, vector
 from ..problem.rules import check_endless, check_regulator
 from ..problem.sampled import SampledProblem
@@ -146,6 +147,7 @@ class GlobalValue(nn.Module):
         super().__setstate__(state)  # type: ignore[no-untyped-call]
         self._ready()
 
+    @without_gradient("GlobalValue", "x")
     def forward(self, x: Tensor) -> Tensor:
         """u: (..., n) -> (..., m)."""
         rows = x if x.dim() == 2 else x.reshape(-1, x.shape[-1])
@@ -199,6 +201,7 @@ class GlobalValue(nn.Module):
             best = torch.minimum(best, paid + self.value(after))
         return (best - found.value) / found.value
 
+    @without_gradient("GlobalValue", "x")
     def choose(self, x: Tensor, without: Tensor | None = None) -> Choice:
         """The best candidate at every state.
 
@@ -207,8 +210,7 @@ class GlobalValue(nn.Module):
             without: index of a trajectory whose models are no candidates, (B,) int64.
         """
         entries = self.nearest(x, without)
-        with torch.no_grad():
-            cost, control, covered = self.follow(x, entries)
+        cost, control, covered = self.follow(x, entries)
         value, at = cost.min(1, keepdim=True)
         u = control.gather(1, at.unsqueeze(-1).expand(-1, -1, control.shape[-1])).squeeze(1)
         return Choice(u, value.squeeze(1), entries.gather(1, at).squeeze(1), covered.gather(1, at).squeeze(1))

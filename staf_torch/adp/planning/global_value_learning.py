@@ -9,6 +9,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ...lanes.gradients import without_gradient
+from ...lanes.opaque import opaque
 from ...numerics.checks import fail, integer, real
 from ..problem.sampled import SampledProblem
 from .ddp import BoxDDP
@@ -30,6 +32,8 @@ class Guesses(NamedTuple):
     reference: Reference
 
 
+@opaque
+@without_gradient("learn_global_value", "problem")
 def learn_global_value(
     problem: SampledProblem,
     region: Sequence[float] | Tensor,

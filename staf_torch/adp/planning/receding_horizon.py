@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ...lanes import compiled, traced_as, where_rows
+from ...lanes.gradients import without_gradient
 from ...numerics.checks import fail, flag, integer
 from ..loop.controller import Controller
 from ..policies.sampled_rollout import SampledRollout
@@ -119,6 +120,7 @@ class RecedingHorizon(Controller):
         if self._compile and self._search is not None and self.memory is None:
             self._improved.hasten()
 
+    @without_gradient("RecedingHorizon.init", "x0")
     def init(self, x0: Tensor) -> Following:
         """The first plan, from the states x0 (B, n)."""
         if self._search is None and self.memory is not None:
@@ -134,6 +136,7 @@ class RecedingHorizon(Controller):
         plan = resting(self.problem, self.problem.goals(x0, self.steps)[:, :-1])
         return Following(plan, torch.zeros_like(plan[:, 0, 0]))
 
+    @without_gradient("RecedingHorizon.step", "x")
     def step(self, x: Tensor, carried: Following, uniform: Tensor, dt: float) -> tuple[Tensor, Following]:
         """The first control of the improved plan (B, m), and the plan a step further on."""
         if self._search is None:
@@ -275,6 +278,7 @@ class StrainedPlans(Controller):
     def label(self) -> str:
         return type(self.policy).__name__
 
+    @without_gradient("NearOptimal.controller().init", "x0")
     def init(self, x0: Tensor) -> Following:
         """The first plans from x0 (B, n), of the rows that need one.
 
@@ -287,6 +291,7 @@ class StrainedPlans(Controller):
         # Saves work: the best of several takes a tenth of a second.
         return where_rows(self._strained(x0), self._begun.init, x0, _without(self._begun.idle(x0)))
 
+    @without_gradient("NearOptimal.controller().step", "x")
     def step(self, x: Tensor, carried: Following, uniform: Tensor, dt: float) -> tuple[Tensor, Following]:
         def planned(now: tuple[Tensor, Following, Tensor]) -> tuple[Tensor, Following]:
             x, carried, uniform = now

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from ...approximation.basis import StaFBasis
 from ...lanes import compiled, each, repeat, scan
+from ...lanes.gradients import refuse_gradient
 from ...numerics.box import LARGEST, box_minimum
 from ...numerics.checks import fail, integer, positive_real
 from ...systems import Bounds, Plant, StepPlant
@@ -262,7 +263,8 @@ class FollowedSimulator:
     bounds: Bounds
 
     def __call__(self, x: Tensor, steps: int) -> tuple[Tensor, Tensor]:
-        rows = x.detach().reshape(-1, x.shape[-1]).to("cpu", torch.float64).numpy()
+        refuse_gradient(f"{type(self.plant).__name__} of a function without derivatives", x=x)
+        rows = x.reshape(-1, x.shape[-1]).to("cpu", torch.float64).numpy()
         linear = type(self.base) is LQR and type(self.base.cost) is QuadraticCost
         feedback = self._linear() if linear else self._asked
         states, controls = self.plant.function.follow(rows, feedback, steps)

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ...lanes.gradients import without_gradient
 from ...numerics.checks import fail, positive_real
 from ...numerics.differences import STEP, central_slopes
 from ...numerics.exponential_step import quadratic_integral
@@ -147,6 +148,7 @@ class HeldStability(NamedTuple):
     # inf: stable up to 100 time constants of the fastest mode, or 1000 steps of a plant in discrete time
 
 
+@without_gradient("held_stability", "policy", "system", "at")
 def held_stability(
     policy: Callable[[Tensor], Tensor], system: Plant, period: float, *, at: Tensor | None = None
 ) -> HeldStability:

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from ...lanes import each, traced_as
+from ...lanes.gradients import without_gradient
 from ...numerics.angles import turned, unwrapped, wrap
 from ...numerics.checks import fail, integer, trailing
 from ...numerics.forward_mode import use_forward_mode
@@ -72,6 +73,7 @@ class SampledProblem(nn.Module):
         ValueError: if an argument breaks its rule or ``step`` returns other shapes.
     """
 
+    @without_gradient("SampledProblem", "step", "goal", "rest", "terminal")
     def __init__(
         self,
         step: StepFunction,
@@ -128,6 +130,7 @@ class SampledProblem(nn.Module):
             )
 
     @classmethod
+    @without_gradient("SampledProblem.of", "plant", "cost", "terminal")
     def of(
         cls,
         plant: Plant,

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ...lanes import compiled, repeat, where_rows
+from ...lanes.gradients import gradients_of, marked
 from ...numerics.checks import fail, one_or_each, positive, positive_real, trailing
 from ...systems import Bounds, Plant
 from ...systems.bounds import Limit
@@ -125,7 +126,6 @@ class SafetyFilter(Controller):
     (2020), for what a backup law keeps.
     """
 
-    @torch.no_grad()  # also of networks, whose parameters want gradients
     def __init__(
         self,
         policy: Policy | Controller,
@@ -142,14 +142,30 @@ class SafetyFilter(Controller):
     ) -> None:
         super().__init__()
         check_traceable("SafetyFilter", plant)
+        own = Bounds(low, high, plant.inputs)
+        self.bounds = plant.bounds if not own.present and plant.bounds is not None else own
+        given = {"plant": plant, "constraints": constraints} if self.bounds.present else {}
+        self.layers = gradients_of("SafetyFilter", **given)  # what brakes can do is a number
+        with torch.no_grad():
+            self._design(policy, plant, constraints, dt, decay, degree, margin, weight)
+
+    def _design(
+        self,
+        policy: Policy | Controller,
+        plant: Plant,
+        constraints: Constraint | Sequence[Constraint],
+        dt: float,
+        decay: float | Sequence[float] | None,
+        degree: int | Sequence[int] | None,
+        margin: float | Sequence[float],
+        weight: Sequence[float] | None,
+    ) -> None:
         self.controller = policy if isinstance(policy, Controller) else Feedback(policy)
         self.plant, self.draws = plant, self.controller.draws
         self.hold = positive_real("SafetyFilter", "dt", dt)
         self.period = self.hold
         self.constraints = listed("SafetyFilter", constraints)
         count = len(self.constraints)
-        own = Bounds(low, high, plant.inputs)
-        self.bounds = plant.bounds if not own.present and plant.bounds is not None else own
         self.conditions = Conditions(plant, self.constraints, self.bounds, self.hold, decay, degree, margin)
         self.degree, self.moving = self.conditions.degree, self.conditions.moving
         heavy = one_or_each("SafetyFilter", "weight", 1.0 if weight is None else weight, plant.inputs)
@@ -215,7 +231,7 @@ class SafetyFilter(Controller):
         found, k = self._nearest(torch.cat((x, u, time.unsqueeze(-1)), dim=-1)), len(self.constraints)
         control, margin, more = found.split((m := u.shape[-1], k, found.shape[-1] - m - k), dim=-1)
         astray = more[..., 1] if self.ahead.opposed else torch.zeros_like(time)
-        return Filtered(control, margin, more[..., 0], astray)
+        return marked("SafetyFilter", self.layers, Filtered(control, margin, more[..., 0], astray))
 
     def init(self, x0: Tensor) -> Watched:
         none = x0.new_zeros(len(x0))

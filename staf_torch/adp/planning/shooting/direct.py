@@ -9,6 +9,8 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from ....lanes.gradients import without_gradient
+from ....lanes.opaque import opaque
 from ....numerics.checks import fail, integer, positive_real, trailing
 from ....numerics.linalg import positive_semidefinite
 from ....systems import ControlAffineSystem, Linear, Plant
@@ -109,6 +111,7 @@ class DirectShooting:
     differential dynamic programming", ICRA 2014, for the box.
     """
 
+    @without_gradient("DirectShooting", "system", "cost", "base", "terminal")
     def __init__(
         self,
         system: Plant,
@@ -143,7 +146,7 @@ class DirectShooting:
         self.bases, self.alone = given, base is None and self.lqr is None
         self.terminal = self._end(terminal)
         x = set_point(system, cost)[0]
-        ends = float(self.terminal(x.unsqueeze(0)).detach().abs())
+        ends = float(self.terminal(x.unsqueeze(0)).abs())
         self.stays = ends <= _NOTHING and not restless(system, cost)
         self.quadratic_end = not callable(cost.ending if terminal is None else terminal)
         self.stated = (horizon, intervals)
@@ -208,6 +211,8 @@ class DirectShooting:
         end = positive_semidefinite("DirectShooting", "terminal", end, cost.dim)
         return lambda x: quadratic(end, cost.deviation(x))
 
+    @opaque
+    @without_gradient("DirectShooting.solve", "x0", "self")
     def solve(self, x0: Tensor, *, warm: Optimum | None = None) -> Optimum:
         """The optima from x0, (B, n).
 
@@ -219,13 +224,10 @@ class DirectShooting:
             ValueError: if x0 is no batch of states of the plant.
         """
         trailing("DirectShooting.solve", "x0", x0, dims=2, last=self.stage.system.dim)
-        with torch.no_grad():
-            parts = [
-                self._solve(
-                    rows, None if warm is None else selected(warm, k * ROWS + torch.arange(len(rows)))
-                )
-                for k, rows in enumerate(x0.split(ROWS))
-            ]
+        parts = [
+            self._solve(rows, None if warm is None else selected(warm, k * ROWS + torch.arange(len(rows))))
+            for k, rows in enumerate(x0.split(ROWS))
+        ]
         return parts[0] if len(parts) == 1 else joined(parts)
 
     def _solve(self, x0: Tensor, warm: Optimum | None) -> Optimum:

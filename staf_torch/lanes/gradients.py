@@ -1,0 +1,142 @@
+"""Gradients that nobody computes: refused where one is wanted, so that none is absent without a word.
+
+Planners, filters of streams and closed loops run without autograd. Asked with a tensor that requires a
+gradient, while autograd is on, they refuse in one sentence. Parameters of torch's own layers require one by
+default, and a network that was trained elsewhere is no question for a derivative: these are taken as numbers,
+and what is computed with them refuses the backward pass to them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import inspect
+import io
+from collections.abc import Callable, Sequence
+from typing import Any, ParamSpec, TypeVar
+
+import torch
+from torch import Tensor
+
+from .contents import Walk
+from .tree import flatten, unflatten
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+_REMEDY = "call it under `torch.no_grad()`, or give what is detached (`.detach()`, `.requires_grad_(False)`)"
+
+
+def refuse_gradient(call: str, **given: Any) -> tuple[Tensor, ...]:
+    """Refuse, while autograd is on, what requires a gradient: tensors, and what objects hold or lead to.
+
+    Args:
+        call: that computes none, for the message.
+        given: its arguments by name.
+
+    Returns:
+        The parameters of layers that require one, for `marked`.
+
+    Raises:
+        ValueError: if a tensor that is no parameter of a layer requires a gradient.
+    """
+    layers: list[Tensor] = []
+    for name, value in given.items() if torch.is_grad_enabled() else ():
+        found, some = _wanting(value)
+        if found:
+            what = "it" if found[0] is value else f"a tensor of shape {tuple(found[0].shape)} in it"
+            raise ValueError(
+                f"`{call}` computes no gradient, and `{name}` must not require one: {what} does; {_REMEDY}."
+            )
+        layers += some
+    return tuple(layers)
+
+
+def gradients_of(call: str, **given: Any) -> tuple[Tensor, ...]:
+    """Return the tensors that require a gradient, of an object that keeps numbers made from them: as
+    `refuse_gradient` where autograd is on, and where it is off all that somebody may ask for later.
+
+    Args:
+        call, given: as in `refuse_gradient`.
+    """
+    if torch.is_grad_enabled():
+        return refuse_gradient(call, **given)
+    found = [part for value in given.values() for parts in _wanting(value) for part in parts]
+    return tuple(part for part in found if part.is_leaf)  # others cannot be copied
+
+
+def marked(call: str, layers: Sequence[Tensor], result: _R) -> _R:
+    """Return a tree of results that refuse the backward pass to parameters of layers, where any require one.
+
+    Args:
+        call: that computed the results without gradients, for the message.
+        layers: as `refuse_gradient` returned them.
+        result: tensors, nested tuples, lists and dictionaries of them, or a dataclass of such but its ``time``.
+    """
+    wanted = [part for part in layers if part.requires_grad] if layers and torch.is_grad_enabled() else []
+    if not wanted:
+        return result
+    if dataclasses.is_dataclass(result) and not isinstance(result, type):
+        fields = {f.name: getattr(result, f.name) for f in dataclasses.fields(result) if f.name != "time"}
+        return dataclasses.replace(result, **marked(call, layers, fields))
+    leaves, structure = flatten(result)
+    real = [_Unserved.apply(leaf, wanted[0], call) if leaf.is_floating_point() else leaf for leaf in leaves]  # type: ignore[no-untyped-call]
+    again: _R = unflatten(structure, iter(real))
+    return again
+
+
+def without_gradient(call: str, *names: str) -> Callable[[Callable[_P, _R]], Callable[_P, _R]]:
+    """Decorate a function that runs without autograd: it refuses arguments that require a gradient.
+
+    Args:
+        call: the function, for the message.
+        names: of the arguments that are looked at.
+    """
+
+    def decorated(function: Callable[_P, _R]) -> Callable[_P, _R]:
+        places = [(name, [*inspect.signature(function).parameters].index(name)) for name in names]
+
+        @functools.wraps(function)
+        def alone(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+            if not torch.is_grad_enabled():
+                return function(*args, **kwargs)
+            given = {name: args[k] if k < len(args) else kwargs.get(name) for name, k in places}
+            given = {"the object" if name == "self" else name: value for name, value in given.items()}
+            layers = refuse_gradient(call, **given)
+            with torch.no_grad():
+                result = function(*args, **kwargs)
+            return marked(call, layers, result) if layers else result
+
+        return alone
+
+    return decorated
+
+
+def _wanting(value: Any) -> tuple[list[Tensor], list[Tensor]]:
+    """Return the tensors of an object that require a gradient: those of somebody, and parameters of layers."""
+    if value is None or isinstance(value, Tensor):
+        return ([value] if value is not None and value.requires_grad else []), []
+    walk = Walk(io.BytesIO())
+    try:
+        walk.dump(value)
+        walk.finish()
+    except Exception:  # an open file, a lock: what came before it is known
+        walk.noted(value)
+    found = [part for part in walk.tensors if part.requires_grad]
+    layers = [part for part in found if id(part) in walk.layers]
+    return [part for part in found if id(part) not in walk.layers], layers
+
+
+class _Unserved(torch.autograd.Function):
+    """The same numbers, of which no derivative is known."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, wanted: Tensor, call: str) -> Tensor:  # type: ignore[override]
+        ctx.call = call
+        return x.clone()
+
+    @staticmethod
+    def backward(ctx: Any, *_: Tensor) -> Any:
+        raise ValueError(
+            f"`{ctx.call}` computes no gradient, and a network that it used has parameters that require one; "
+            f"{_REMEDY}."
+        )
