@@ -212,7 +212,9 @@ class Contents:
 def _is_layer(kind: type) -> bool:
     """Return whether a class makes parameters by itself, which require gradients by default."""
     root, _, rest = kind.__module__.partition(".")
-    return kind is not nn.Module and (root == "torch" or (root == _PACKAGE and rest.startswith("approximation")))
+    return kind is not nn.Module and (
+        root == "torch" or (root == _PACKAGE and rest.startswith("approximation"))
+    )
 
 
 class _Same:

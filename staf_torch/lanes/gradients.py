@@ -23,7 +23,7 @@ from .tree import flatten, unflatten
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
-_REMEDY = "call it under `torch.no_grad()`, or give what is detached (`.detach()`, `.requires_grad_(False)`)"
+_REMEDY = "call it under `torch.no_grad()`, or detach that (`.detach()`, `.requires_grad_(False)`)"
 
 
 def refuse_gradient(call: str, **given: Any) -> tuple[Tensor, ...]:
@@ -42,11 +42,11 @@ def refuse_gradient(call: str, **given: Any) -> tuple[Tensor, ...]:
     layers: list[Tensor] = []
     for name, value in given.items() if torch.is_grad_enabled() else ():
         found, some = _wanting(value)
+        if found and found[0] is value:
+            raise ValueError(f"`{call}` computes no gradient, and `{name}` requires one: {_REMEDY}.")
         if found:
-            what = "it" if found[0] is value else f"a tensor of shape {tuple(found[0].shape)} in it"
-            raise ValueError(
-                f"`{call}` computes no gradient, and `{name}` must not require one: {what} does; {_REMEDY}."
-            )
+            what = f"a tensor of the shape {tuple(found[0].shape)} that requires one"
+            raise ValueError(f"`{call}` computes no gradient, and `{name}` holds {what}: {_REMEDY}.")
         layers += some
     return tuple(layers)
 
@@ -70,7 +70,7 @@ def marked(call: str, layers: Sequence[Tensor], result: _R) -> _R:
     Args:
         call: that computed the results without gradients, for the message.
         layers: as `refuse_gradient` returned them.
-        result: tensors, nested tuples, lists and dictionaries of them, or a dataclass of such but its ``time``.
+        result: tensors, nested tuples, lists and dictionaries of them, or a dataclass of these.
     """
     wanted = [part for part in layers if part.requires_grad] if layers and torch.is_grad_enabled() else []
     if not wanted:
@@ -112,7 +112,7 @@ def without_gradient(call: str, *names: str) -> Callable[[Callable[_P, _R]], Cal
 
 
 def _wanting(value: Any) -> tuple[list[Tensor], list[Tensor]]:
-    """Return the tensors of an object that require a gradient: those of somebody, and parameters of layers."""
+    """Return the tensors of an object that require a gradient: of somebody, and parameters of layers."""
     if value is None or isinstance(value, Tensor):
         return ([value] if value is not None and value.requires_grad else []), []
     walk = Walk(io.BytesIO())
@@ -136,7 +136,5 @@ class _Unserved(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *_: Tensor) -> Any:
-        raise ValueError(
-            f"`{ctx.call}` computes no gradient, and a network that it used has parameters that require one; "
-            f"{_REMEDY}."
-        )
+        told = "and holds a network whose parameters require one"
+        raise ValueError(f"`{ctx.call}` computes no gradient, {told}: {_REMEDY}.")

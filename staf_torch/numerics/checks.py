@@ -9,11 +9,12 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Collection, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
 
+from ..lanes.gradients import refuse_gradient
 from . import COMMAND_LINE as COMMAND_LINE
 from . import fail as fail
 from . import show
@@ -109,9 +110,17 @@ def vector(call: str, name: str, value: object, length: int | None = None) -> li
     return [float(v) for v in numbers]
 
 
+def numbers_of(call: str, name: str, value: Any) -> Any:
+    """The numbers of a tensor, which carry no gradient on, as nested lists; anything else as it is."""
+    if not isinstance(value, Tensor):
+        return value
+    refuse_gradient(call, **{name: value})
+    return value.tolist()
+
+
 def one_or_each(call: str, name: str, value: object, count: int) -> Tensor:
     """Return a finite number for each of ``count``, given as one for all or one each: (count,) float64."""
-    given = number(call, name, value).tolist() if isinstance(value, Tensor) else value  # type: ignore[union-attr]
+    given = numbers_of(call, name, number(call, name, value) if isinstance(value, Tensor) else value)
     if not isinstance(given, Sequence):
         given = [real(call, name, given)] * count
     numbers = vector(call, name, given)

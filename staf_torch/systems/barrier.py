@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..numerics.angles import wrap
-from ..numerics.checks import fail, hold
+from ..numerics.checks import fail, hold, numbers_of
 from .base import ControlAffineSystem, Linearisation, Units
 
 Wall = float | Sequence[float | None] | Tensor | None
@@ -211,11 +211,11 @@ class Barrier(ControlAffineSystem):
 
 def wall_numbers(call: str, name: str, given: Wall, none: float, size: int) -> Tensor:
     """Return a wall for each coordinate, (n,) float64."""
-    numbers = given.tolist() if isinstance(given, Tensor) else given
-    listed = [numbers] * size if numbers is None or isinstance(numbers, int | float) else numbers
-    if isinstance(listed, str) or not isinstance(listed, Sequence) or len(listed) != size:
+    numbers = numbers_of(call, name, given)
+    every = [numbers] * size if numbers is None or isinstance(numbers, int | float) else numbers
+    if isinstance(every, str) or not isinstance(every, Sequence) or len(every) != size:
         raise fail(call, name, f"must be a number or one for each of the {size} states", given)
-    walls = [none if one is None else one for one in listed]
+    walls = [none if one is None else one for one in every]
     if not all(isinstance(one, int | float) and not isinstance(one, bool) for one in walls):
         raise fail(call, name, "must be numbers or None", given)
     if any(math.isnan(one) or one == -none for one in walls):

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ..numerics.checks import fail
+from ..numerics.checks import fail, numbers_of
 
 Limit = float | Sequence[float] | Tensor | None
 
@@ -75,8 +75,9 @@ def _limit(name: str, given: Limit, none: float, inputs: int) -> Tensor:
         given = none
     if isinstance(given, bool) or not isinstance(given, int | float | Sequence | Tensor):
         raise fail("Bounds", name, "must be a number or one an input", given)
+    numbers = numbers_of("Bounds", name, given)
     try:
-        limit = torch.as_tensor(given, dtype=torch.float64).detach().clone()
+        limit = torch.as_tensor(numbers, dtype=torch.float64)
     except (TypeError, ValueError) as error:
         raise fail("Bounds", name, "must be a number or one an input", given) from error
     if limit.dim() == 0:

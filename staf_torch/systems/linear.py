@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ..numerics.checks import fail, hold, vector
+from ..numerics.checks import fail, hold, numbers_of, vector
 from ..numerics.linalg import exponential, riccati
 from .base import ControlAffineSystem
 
@@ -66,7 +66,7 @@ class Linear(ControlAffineSystem):
 
 
 def _rows(name: str, matrix: object, rule: str) -> Sequence[Sequence[float]]:
-    rows = matrix.tolist() if isinstance(matrix, Tensor) else matrix
+    rows = numbers_of("Linear", name, matrix)
     if isinstance(rows, str) or not isinstance(rows, Sequence) or not rows:
         raise fail("Linear", name, rule, matrix)
     if not all(isinstance(row, Sequence) and not isinstance(row, str) for row in rows):

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ..numerics.checks import hold, vector
+from ..numerics.checks import hold, numbers_of, vector
 from .base import ControlAffineSystem
 from .two_state import input_gain
 
@@ -36,7 +36,7 @@ class TwoStateChain(ControlAffineSystem):
 
     def __init__(self, theta: Sequence[float] = (1.0, -1.0, -0.5, 0.5)) -> None:
         super().__init__()
-        given = theta.tolist() if isinstance(theta, Tensor) else list(theta)
+        given = list(numbers_of("TwoStateChain", "theta", theta))
         numbers = vector("TwoStateChain", "theta", given, 4)
         self.theta = hold(self, "theta", torch.tensor(numbers, dtype=torch.float64))
 

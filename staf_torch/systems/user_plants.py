@@ -10,7 +10,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from ..numerics.checks import fail, integer, positive_real, vector
+from ..numerics.checks import fail, integer, numbers_of, positive_real, vector
 from .base import Linearisation, Plant
 from .black_box import BlackBox, Motion, Slopes
 from .bounds import Bounds, Limit
@@ -199,7 +199,7 @@ def _guess(call: str, given: Guess, dim: int, inputs: int) -> tuple[Tensor, Tens
     state, held = given if pair else (given, u)
     points = []
     for value, size in ((state, dim), (held, inputs)):
-        numbers = vector(call, "equilibrium", value.tolist() if isinstance(value, Tensor) else value)
+        numbers = vector(call, "equilibrium", numbers_of(call, "equilibrium", value))
         if len(numbers) != size:
             rule = f"must be {dim} numbers, or those and {inputs} of the input"
             raise fail(call, "equilibrium", rule, given)

@@ -15,7 +15,7 @@ from .bases import ValueBasis
 
 
 def value_gradient(value: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
-    """grad V, row by row, 0 where V is constant: (..., n) -> (..., n). It has derivatives where x or V want any."""
+    """grad V, row by row, 0 where V is constant, and differentiable where x or V is: (..., n) -> (..., n)."""
     learnt = torch.is_grad_enabled() and (x.requires_grad or value(x).requires_grad)
     with torch.enable_grad():
         at = x if learnt and x.requires_grad else x.detach().requires_grad_()

@@ -211,8 +211,9 @@ class LQR(nn.Module):
             P and K have none with respect to them, and what is computed from them refuses to be asked for it.
 
     Raises:
-        ValueError: if what the plant or the cost holds otherwise requires a gradient, the plant does not rest at the set-point under an input within the bounds, its
-            linearisation cannot be stabilised, or the cost does not see a mode that does not decay.
+        ValueError: if the plant does not rest at the set-point under an input within the bounds, its
+            linearisation cannot be stabilised, or the cost does not see a mode that does not decay; if either
+            holds a tensor that requires a gradient, other than a network's.
     """
 
     def __init__(self, system: Plant, cost: Cost, period: float | None = None) -> None:

@@ -11,7 +11,17 @@ from torch import Tensor, nn
 
 from ...numerics.angles import periods_of, turned, wrap, wrap_each
 from ...numerics.box import LARGEST, box_minimum, face_inverses
-from ...numerics.checks import copied, fail, non_negative, one_or_each, positive, positive_real, real, vector
+from ...numerics.checks import (
+    copied,
+    fail,
+    non_negative,
+    numbers_of,
+    one_or_each,
+    positive,
+    positive_real,
+    real,
+    vector,
+)
 from ...numerics.linalg import positive_definite, positive_semidefinite
 from ...systems import Bounds, Plant
 from ...systems.bounds import Limit
@@ -415,7 +425,7 @@ def square(call: str, name: str, value: Matrix, size: int) -> Tensor:
 def _point(call: str, name: str, value: Sequence[float] | Tensor | None, size: int) -> Tensor | None:
     if value is None:
         return None
-    given = value.tolist() if isinstance(value, Tensor) else value
+    given = numbers_of(call, name, value)
     if isinstance(given, Sequence) and len(given) != size:
         raise fail(call, name, f"must have {size} numbers", value)
     return torch.tensor(vector(call, name, given, size), dtype=torch.float64)

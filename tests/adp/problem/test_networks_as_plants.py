@@ -1,4 +1,4 @@
-"""Plants, costs, constraints and policies with parameters that want gradients are taken as they are."""
+"""Networks as plants, costs, constraints and policies: taken as they are, and no gradient is silently absent."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Own(systems.ControlAffineSystem):
 
     def __init__(self, dtype: torch.dtype = torch.float64) -> None:
         super().__init__()
-        self.net, self.push = network(2, 2, dtype), nn.Parameter(torch.tensor([[0.0], [1.0]], dtype=dtype))
+        self.net, self.push = network(2, 2, dtype), torch.tensor([[0.0], [1.0]], dtype=dtype)
 
     def drift(self, x: Tensor) -> Tensor:
         return self.net(x)
@@ -49,23 +49,36 @@ class Learnt(adp.QuadraticCost):
         return self.net(x)[..., 0].square()
 
 
+def refuses(result: Tensor, call: str) -> None:
+    with pytest.raises(
+        ValueError, match=rf"`{call}` computes no gradient.*call it under `torch.no_grad\(\)`"
+    ):
+        (result.sum() + sum(part.square().sum() for part in NET.parameters())).backward()
+
+
 @pytest.mark.parametrize(
     ("plant", "cost"), [(STEP, COST), (RATE, COST), (Own(), COST), (systems.Pendulum(), Learnt())]
 )
-def test_every_planner_takes_networks_and_gives_no_gradient(plant: systems.Plant, cost: adp.Cost) -> None:
+def test_every_planner_takes_networks_and_refuses_the_backward_pass_to_them(
+    plant: systems.Plant, cost: adp.Cost
+) -> None:
     problem = adp.SampledProblem.of(plant, cost, dt=0.05, terminal=0.0)
     plan = adp.BoxDDP(problem, steps=6, iterations=4, compile=False).solve(X0)
-    assert not plan.cost.requires_grad
+    refuses(plan.cost, "BoxDDP.solve")
+    with torch.no_grad():
+        again = adp.BoxDDP(problem, steps=6, iterations=4, compile=False).solve(X0)
+    assert torch.equal(again.cost, plan.cost) and not again.cost.requires_grad
     for planner in (
         adp.RecedingHorizon(problem, steps=6, compile=False),
         adp.PathIntegral(problem, steps=6, samples=10, knots=2, noise=0.5, compile=False),
     ):
         run = adp.simulate(planner, plant, cost, X0, dt=0.05, steps=2, compile=False)
         assert torch.isfinite(run.cost).all()
-        assert not run.cost.requires_grad
+        refuses(run.cost, "adp.simulate")
     if plant.period is None:
         shot = adp.DirectShooting(plant, cost, horizon=0.3, intervals=6, terminal=0.0).solve(X0)
         torch.testing.assert_close(shot.value, plan.cost, rtol=0.05, atol=1e-4)
+        refuses(shot.control, "DirectShooting.solve")
 
 
 def test_a_learnt_plant_has_the_regulator_of_the_same_plant_without_parameters() -> None:
@@ -80,7 +93,7 @@ def test_a_learnt_plant_has_the_regulator_of_the_same_plant_without_parameters()
 def test_policies_and_constraints_that_are_networks_run_and_are_filtered() -> None:
     policy, plant = network(2, 1), systems.Pendulum()
     run = adp.simulate(adp.Feedback(policy), plant, COST, X0, dt=0.05, steps=2, compile=False)
-    assert not run.cost.requires_grad
+    refuses(run.state, "adp.simulate")
     wall = network(2, 1)
     filtered = adp.SafetyFilter(policy, plant, lambda x, t: 2 + wall(x)[..., 0], dt=0.05, low=-5.0, high=5.0)
     assert torch.isfinite(filtered(X0)).all()
