@@ -13,11 +13,12 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Iterator
-from types import MethodType
+from types import CodeType, MethodType
 from typing import Any, Protocol, overload
 
 import torch
 from torch import Tensor, nn
+from torch.compiler import is_exporting
 
 from .call import PlannedCall, ordinary
 from .contents import BOUND, Contents
@@ -170,7 +171,7 @@ class CompiledMethod:
     def __call__(self, x: Tensor, /, *more: Tree) -> Any:
         """y: (..., n) -> (..., m), or trees of (B, ...)."""
         if not ordinary(flatten((x, *more))[0] if more else (x,)) or x.numel() == 0 or tracing_now():
-            return self.definition(x, *more)
+            return self._exported(x, *more) if is_exporting() else self.definition(x, *more)
         if self._served is None or _when == "never":
             rows = x.numel() / x.shape[-1]
             if not self._pays(rows):
@@ -187,6 +188,20 @@ class CompiledMethod:
         dims = x.dim()
         y = served(x if dims <= 2 else x.reshape(-1, x.shape[-1]))
         return y.view(-1) if dims == 1 else y.reshape(*x.shape[:-1], y.shape[-1])
+
+    def _exported(self, x: Tensor, *more: Tree) -> Any:
+        """Compute by the definition for `torch.export`, which has no words for what it does not take."""
+        try:
+            return self.definition(x, *more)
+        except Exception as error:
+            told = f"`torch.export` does not take {self._settings.name} ({type(self.owner).__name__})"
+            remedy = "`staf_torch.deploy.trace(policy, x)` makes such a program, its `export_c` a C header"
+            raise ValueError(f"{told}: {remedy}.") from error
+
+    @property
+    def __code__(self) -> CodeType:
+        """Of the definition, for `torch.export`."""
+        return self.definition.__code__
 
     def _pays(self, rows: float) -> bool:
         """Return whether the calls so far and this one repay a compiler: a large batch does by itself."""

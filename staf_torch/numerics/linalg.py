@@ -45,7 +45,7 @@ def positive_definite(call: str, name: str, matrix: Tensor, size: int) -> Tensor
         ValueError: if it is anything else.
     """
     _symmetric(call, name, matrix, size)
-    if float(torch.linalg.eigvalsh(matrix)[0]) <= 0:
+    if float(torch.linalg.eigvalsh(matrix.detach())[0]) <= 0:
         raise fail(call, name, "must be positive definite", matrix)
     return matrix.to(torch.float64)
 
@@ -57,7 +57,7 @@ def positive_semidefinite(call: str, name: str, matrix: Tensor, size: int) -> Te
         ValueError: if it is anything else.
     """
     _symmetric(call, name, matrix, size)
-    values = torch.linalg.eigvalsh(matrix)
+    values = torch.linalg.eigvalsh(matrix.detach())
     if float(values[0]) < -1e-12 * float(values.abs().max()):
         raise fail(call, name, "must be positive semidefinite", matrix)
     return matrix.to(torch.float64)

@@ -1,4 +1,4 @@
-"""Networks as plants, costs, constraints and policies: taken as they are, and no gradient is silently absent."""
+"""Networks as plants, costs, constraints and policies are taken as they are, and refuse the backward pass."""
 
 from __future__ import annotations
 
@@ -67,7 +67,8 @@ def test_every_planner_takes_networks_and_refuses_the_backward_pass_to_them(
     refuses(plan.cost, "BoxDDP.solve")
     with torch.no_grad():
         again = adp.BoxDDP(problem, steps=6, iterations=4, compile=False).solve(X0)
-    assert torch.equal(again.cost, plan.cost) and not again.cost.requires_grad
+    assert torch.equal(again.cost, plan.cost)
+    assert not again.cost.requires_grad
     for planner in (
         adp.RecedingHorizon(problem, steps=6, compile=False),
         adp.PathIntegral(problem, steps=6, samples=10, knots=2, noise=0.5, compile=False),

@@ -1,0 +1,169 @@
+"""A gradient is right, or it raises: none is absent without a word."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from helpers import tensor, uniform
+from torch import Tensor, nn
+
+import staf_torch as st
+from staf_torch import adp, systems
+
+COST = adp.QuadraticCost(1.0, 0.1, dim=2, inputs=1)
+PLANT = systems.Pendulum()
+X0 = tensor([[0.5, 0.1], [0.2, -0.3]])
+
+
+class Gravity(systems.ControlAffineSystem):
+    dim, inputs = 2, 1
+
+    def __init__(self, gravity: Tensor) -> None:
+        super().__init__()
+        self.gravity = gravity
+
+    def drift(self, x: Tensor) -> Tensor:
+        return torch.stack((x[..., 1], self.gravity * x[..., 0].sin()), dim=-1)
+
+    def effectiveness(self, x: Tensor) -> Tensor:
+        return tensor([[0.0], [1.0]]).expand(*x.shape, 1)
+
+
+def loop(
+    policy: Any = lambda x: -x.sum(-1, keepdim=True), plant: Any = PLANT, cost: Any = COST, x: Any = X0
+) -> Tensor:
+    return adp.simulate(policy, plant, cost, x, dt=0.02, steps=2, compile=False).cost
+
+
+def wanted_control(x: Tensor) -> Tensor:
+    return 9 * x.sum(-1, keepdim=True)
+
+
+def numpy_step(x: Any, u: Any) -> Any:
+    return 0.9 * x + 0.1 * u.repeat(2, 1)
+
+
+def samples() -> tuple[Tensor, Tensor]:
+    return uniform(20, 2), uniform(20)
+
+
+PROBLEM = adp.SampledProblem.of(PLANT, COST, dt=0.05)
+BOX = systems.StepPlant(numpy_step, dim=2, inputs=1, dt=0.1)
+REGRESSOR = st.StaFRegressor().fit(*samples())
+WITHOUT: dict[str, tuple[Callable[[Tensor], Any], Tensor]] = {
+    "adp.simulate controller": (lambda k: loop(lambda x: -x @ k.mT), tensor([[1.0, 2.0]])),
+    "adp.simulate x0": (lambda x: loop(x=x), X0),
+    "adp.simulate system": (lambda g: loop(plant=Gravity(g)), tensor(1.0)),
+    "adp.simulate cost": (
+        lambda q: loop(cost=adp.QuadraticCost(q, 0.1, dim=2, inputs=1)),
+        torch.eye(2).double(),
+    ),
+    "LQR system": (lambda g: adp.LQR(Gravity(g), COST).k, tensor(1.0)),
+    "LQR cost": (lambda r: adp.LQR(PLANT, adp.QuadraticCost(1.0, r, 2, 1), 0.1).p, tensor([[0.1]])),
+    "SampledProblem.of plant": (lambda g: adp.SampledProblem.of(Gravity(g), COST, dt=0.05).k, tensor(1.0)),
+    "adp.near_optimal plant": (
+        lambda g: adp.near_optimal(Gravity(g), COST, dt=0.1, reach="local"),
+        tensor(1.0),
+    ),
+    "BoxDDP.solve x0": (lambda x: adp.BoxDDP(PROBLEM, steps=3, compile=False).solve(x).cost, X0),
+    "RecedingHorizon.init x0": (
+        lambda x: adp.RecedingHorizon(PROBLEM, steps=3, compile=False).init(x).plan,
+        X0,
+    ),
+    "DirectShooting terminal": (
+        lambda s: adp.DirectShooting(
+            PLANT, COST, horizon=0.2, intervals=4, terminal=lambda x: s * x[..., 0] ** 2
+        ),
+        tensor(1.0),
+    ),
+    "DirectShooting.solve x0": (
+        lambda x: adp.DirectShooting(PLANT, COST, horizon=0.2, intervals=4, terminal=0.0).solve(x).value,
+        X0,
+    ),
+    "SafetyFilter constraints": (
+        lambda w: adp.SafetyFilter(
+            wanted_control, PLANT, lambda x, t: w - x[:, 0], dt=0.02, low=-9.0, high=9.0
+        )(X0),
+        tensor(0.6),
+    ),
+    "held_stability policy": (
+        lambda k: adp.held_stability(lambda x: -x @ k.mT, PLANT, 0.1),
+        tensor([[9.0, 2.0]]),
+    ),
+    "find_equilibrium plant": (lambda g: systems.find_equilibrium(Gravity(g), [0.1, 0.0]).state, tensor(1.0)),
+    "StepPlant x": (lambda x: BOX.step(x, x[:, :1].detach()), X0),
+    "Linear matrix": (lambda a: systems.Linear(a, [[0.0], [1.0]]).drift(X0), torch.eye(2).double()),
+    "Bounds low": (lambda low: systems.Bounds(low, None, 1).low, tensor([-1.0])),
+    "predict x": (REGRESSOR.predict, X0[0]),
+    "fit y": (lambda y: st.StaFRegressor().fit(uniform(20, 2), y), samples()[1]),
+}
+
+
+@pytest.mark.parametrize("name", WITHOUT)
+def test_what_runs_without_autograd_refuses_what_requires_a_gradient(name: str) -> None:
+    function, at = WITHOUT[name]
+    with pytest.raises(
+        ValueError, match=rf"{name.split()[1]}` (requires|holds).*`torch.no_grad\(\)`"
+    ) as said:
+        function(at.clone().requires_grad_())
+    assert "\n" not in str(said.value)
+    with torch.no_grad():
+        function(at.clone().requires_grad_())
+
+
+def test_the_gradient_of_a_closed_loop_with_a_penalty_is_no_half_of_it() -> None:
+    k = tensor([[1.0, 2.0]]).requires_grad_()
+    with pytest.raises(ValueError, match=r"`adp.simulate` computes no gradient, and `controller` holds"):
+        (loop(lambda x: -x @ k.mT).mean() + 0.1 * k.square().sum()).backward()
+    gain = nn.Parameter(torch.ones(1, 2).double())
+    own = nn.Module()
+    own.gain, own.forward = gain, lambda x: -x @ gain.mT  # type: ignore[method-assign]
+    with pytest.raises(ValueError, match="`controller` holds a tensor"):
+        loop(own)
+    gain.requires_grad_(False)
+    assert not loop(own).requires_grad
+
+
+def test_a_policy_that_plans_has_no_derivative() -> None:
+    policy = adp.near_optimal(PLANT, COST, dt=0.05, low=-9.0, high=9.0, plan=True, reach="local")
+    with pytest.raises(
+        ValueError, match=r"`near_optimal\(plan=True\)` computes no gradient, and `x` requires one"
+    ):
+        policy(X0.clone().requires_grad_())
+
+
+def test_what_is_designed_without_autograd_refuses_to_be_asked_later() -> None:
+    with torch.no_grad():
+        lqr = adp.LQR(Gravity(tensor(1.0).requires_grad_()), COST)
+    with pytest.raises(ValueError, match="`LQR` computes no gradient"):
+        lqr(X0).sum().backward()
+
+
+POLICIES: dict[str, tuple[Callable[..., Tensor], tuple[Tensor, ...]]] = {
+    "LQR": (adp.LQR(PLANT, COST), (X0,)),
+    "near_optimal": (adp.near_optimal(PLANT, COST, dt=0.1, reach="local").control, (X0[:1],)),
+    "RolloutPolicy": (adp.RolloutPolicy.of_lqr(PLANT, COST, steps=2), (X0[:1],)),
+    "SafetyFilter": (
+        lambda x, k, w: adp.SafetyFilter(
+            lambda x: x @ k.mT, PLANT, lambda x, t: w - x[:, 0], dt=0.02, decay=9.0
+        )(x),
+        (tensor([[0.5, 0.1], [0.59, 0.4]]), tensor([[3.0, 1.0]]), tensor(0.6)),
+    ),
+    "hjb_residual": (
+        lambda x, s, g: adp.hjb_residual(Gravity(g), COST, lambda y: s * y.square().sum(-1) ** 2, x),
+        (X0, tensor(1.3), tensor(2.0)),
+    ),
+    "a constant V": (lambda x: adp.hjb_residual(PLANT, COST, lambda y: 0 * y[..., 0] + 1, x), (X0,)),
+    "systems.simulate": (lambda x, g: systems.simulate(Gravity(g), x, dt=0.1, steps=2), (X0, tensor(1.0))),
+}
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_gradients_that_are_computed_are_right(name: str) -> None:
+    function, at = POLICIES[name]
+    given = tuple(part.clone().requires_grad_() for part in at)
+    assert torch.autograd.gradcheck(function, given, fast_mode=True, atol=1e-4, rtol=1e-3)
+    assert not function(*at).requires_grad
