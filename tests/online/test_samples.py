@@ -15,7 +15,7 @@ import staf_torch as st
 KINDS_OF_NUMBERS = [
     torch.tensor([1.0, 2.0]),
     torch.tensor([1, 2]),
-    torch.tensor([1.0, 2.0], dtype=torch.float64, requires_grad=True),
+    torch.tensor([1.0, 2.0], dtype=torch.float64),
     torch.tensor([1.0, 2.0], dtype=torch.float16),
     np.array([1.0, 2.0], np.float32),
     np.array([1, 2.0], dtype=object),
