@@ -177,11 +177,14 @@ class CompiledMethod:
             if not self._pays(rows):
                 return self._counted(rows, x, *more)
         read = self._read
-        if self._served is None or read is None or not read.unchanged(library=False):
+        if read is None or not read.unchanged(library=False):
             read = self._compile(trees=bool(more))
-        served = self._served
-        if served is None or read.wants_gradient():  # of what the owner holds
+        if read.wants_gradient():  # of what the owner holds
             return self.definition(x, *more)
+        if (served := self._served) is None:  # no longer
+            self._compile(trees=bool(more))
+            served = self._served
+        assert served is not None
         self.waits = False
         if more:
             return served(x, *more)
