@@ -232,7 +232,8 @@ class StaF(nn.Module):
         Modes, which differ by O(1):
             ``partial``: d/dy with the centers frozen at x.
             ``total_frozen_weights``: the state moves with y (y - x fixed), the weights w do not.
-                For the exponential kernel with constant offsets: partial + y V^(y).
+                For the exponential kernel with constant offsets: partial + y V^(y); for a kernel of y - c
+                with constant offsets zero, as V^ then moves along unchanged.
             ``total``: the weights are the ideal ones at every state; needs the target, by default
                 that of the last `fit_`.
 

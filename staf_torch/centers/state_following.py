@@ -7,7 +7,7 @@ import abc
 import torch
 from torch import Tensor, nn
 
-from ..numerics.checks import fail, hold, kept, non_negative, positive, shown, trailing
+from ..numerics.checks import fail, hold, kept, non_negative, positive, shown, trailing, values_of
 
 
 class Radius(nn.Module, abc.ABC):
@@ -120,7 +120,7 @@ class StateFollowingCenters(nn.Module):
 
     Raises:
         ValueError: if the directions are not an (M, n) tensor of distinct points of the closed unit
-            ball, or the radius breaks its own rule.
+            ball, or the radius breaks its own rule; later, if a `Radius` of your own returns a negative one.
 
     Source: Rosenfeld et al., section 2.
     """
@@ -129,6 +129,10 @@ class StateFollowingCenters(nn.Module):
         super().__init__()
         self.directions = hold(self, "directions", _checked(directions))
         self.radius = radius if isinstance(radius, Radius) else ConstantRadius(radius)
+        if not isinstance(
+            self.radius, ConstantRadius | StateRadius
+        ):  # a user's: those two check what they hold
+            self.radius.register_forward_hook(_not_negative)
 
     @property
     def count(self) -> int:
@@ -156,6 +160,16 @@ class StateFollowingCenters(nn.Module):
 
     def extra_repr(self) -> str:
         return f"count={self.count}, dim={self.dim}"
+
+
+def _not_negative(radius: nn.Module, _: object, nu: Tensor) -> None:
+    """Refuse a negative nu(x), which would turn the centers around; NaN at a state of NaN passes."""
+    plain = values_of(nu)
+    rule = f"`{type(radius).__name__}` must return radii that are not negative"
+    if plain is not None and bool((plain < 0).any()):
+        raise ValueError(f"{rule}; got {float(plain.min()):.6g}.")
+    if torch.compiler.is_dynamo_compiling():
+        torch._assert_async((~(nu < 0)).all(), f"{rule}.")
 
 
 def _checked(given: Tensor) -> Tensor:

@@ -192,23 +192,33 @@ def kept(module: nn.Module, name: str, *, zero: bool = False, squared: bool = Fa
     if not (value.requires_grad or name in module._parameters) or value.is_meta:
         return value
     least = torch.finfo(value.dtype).tiny ** 0.5 if squared else 0.0
-    rule = f"`{type(module).__name__}({name}=...)` must " + ("not fall below" if zero else "stay above")
-    rule += f" {least:.3g} while it is learned"
-    if torch.compiler.is_compiling():
+    rule = f"`{type(module).__name__}({name}=...)` must " + (
+        "not become negative" if zero else "stay positive"
+    )
+    rule += f" and finite while it is learned{f' (above {least:.3g}, as it is squared)' if squared else ''}"
+    plain = values_of(value)
+    if plain is None:
         if torch.compiler.is_dynamo_compiling():
             inside = (value >= least if zero else value > least) & (value < math.inf)
             torch._assert_async(inside.all(), f"{rule}.")
-    elif not torch._C._len_torch_dispatch_stack():  # a tracer has no values
-        plain = value.detach()
-        while torch._C._functorch.is_functorch_wrapped_tensor(plain):  # inside a transform of torch.func
-            plain = torch._C._functorch.get_unwrapped(plain)
-        for number in [plain.item()] if plain.dim() == 0 else plain.flatten().tolist():
-            if not least <= number < math.inf or (number == least and not zero):
-                raise ValueError(
-                    f"{rule}, and finite; got {number:.6g}. Take smaller steps, or learn its logarithm, with "
-                    "which it cannot leave (approximation/README.md)."
-                )
+        return value
+    for number in [plain.item()] if plain.dim() == 0 else plain.flatten().tolist():
+        if not least <= number < math.inf or (number == least and not zero):
+            raise ValueError(
+                f"{rule}; got {number:.6g}. Take smaller steps, or learn its logarithm, with which it cannot "
+                "leave (approximation/README.md)."
+            )
     return value
+
+
+def values_of(tensor: Tensor) -> Tensor | None:
+    """Return the numbers of a tensor, also inside a transform of `torch.func`; None in a tracer."""
+    if tensor.is_meta or torch.compiler.is_compiling() or torch._C._len_torch_dispatch_stack():
+        return None
+    plain = tensor.detach()
+    while torch._C._functorch.is_functorch_wrapped_tensor(plain):
+        plain = torch._C._functorch.get_unwrapped(plain)
+    return plain
 
 
 def copied(module: Module, **buffers: Tensor) -> Module:

@@ -44,7 +44,7 @@ def test_the_whole_layer_is_one_graph(name: str) -> None:
         torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
     staf.basis.centers.radius.radius.data.fill_(-1.2)  # an assertion of the graph
     with pytest.raises(
-        RuntimeError, match=r"`StateRadius\(radius=...\)` must stay above 0 while it is learned"
+        RuntimeError, match=r"`StateRadius\(radius=...\)` must stay positive and finite while"
     ):
         compiled(y)
 

@@ -28,6 +28,7 @@ from staf_torch import (
     rings,
     targets,
 )
+from staf_torch.centers import Radius
 
 
 class Head(nn.Module):
@@ -258,9 +259,40 @@ def test_what_learning_takes_out_of_its_rule_is_refused_by_name(name: str) -> No
 def test_a_learned_width_whose_square_is_nothing_is_refused(points: Tensor) -> None:
     given = nn.Parameter(torch.tensor(1e-30))  # 1e-60 is 0 in float32
     with pytest.raises(
-        ValueError, match=r"`GaussianKernel\(width=...\)` must stay above 1.08e-19 .* got 1e-30"
+        ValueError, match=r"`GaussianKernel\(width=...\)` must stay positive .*above 1.08e-19.* got 1e-30"
     ):
         StaF(HELD["GaussianKernel(width"](given), init="zeros")(points)
+
+
+class Learned(Radius):
+    """A radius of one's own: what a layer makes of the state."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layer = nn.Linear(2, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.layer(x.float()).squeeze(-1).to(x)
+
+
+def test_a_radius_of_ones_own_that_turns_negative_is_refused(points: Tensor) -> None:
+    radius = Learned()
+    nn.init.constant_(radius.layer.bias, 2.0)
+    basis = copy.deepcopy(StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius)))
+    torch.compile(basis, backend="eager", fullgraph=True)(points[None], points[0])
+    nn.init.constant_(basis.centers.radius.layer.bias, -2.0)
+    states = points[None, :3].double()
+    for call in (
+        lambda: basis(points[None], points[0]),
+        lambda: StaF(basis, init="zeros")(points),
+        lambda: basis.local(points),
+        lambda: chase(states, basis, targets.Paper(), optim.Exact()),
+    ):
+        with (
+            torch.no_grad(),
+            pytest.raises(ValueError, match=r"`Learned` must return radii that are not .*; got -"),
+        ):
+            call()
 
 
 class Exp(nn.Module):
