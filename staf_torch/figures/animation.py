@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from .style import Paper, colour
+from .style import FigurePaper, colour
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -64,8 +64,8 @@ def animate(scene: Scene, kind: str) -> dict[str, bytes]:
     import matplotlib
     from matplotlib.figure import Figure
 
-    with matplotlib.rc_context(Paper().style()):
-        figure = Figure(figsize=(Paper().width, 3.3), layout="constrained")
+    with matplotlib.rc_context(FigurePaper().style()):
+        figure = Figure(figsize=(FigurePaper().width, 3.3), layout="constrained")
         stage = AnimationStage(figure, scene)
         stage.show(0)
         figure.draw_without_rendering()

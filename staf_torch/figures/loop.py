@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..results.pictures import LoopPicture
-from .style import Paper, against_time, colour, dash, legend, letter, panels, printed_on, size
+from .style import FigurePaper, against_time, colour, dash, legend, letter, panels, printed_on, size
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -61,7 +61,7 @@ def draw_loop(picture: LoopPicture, width: object = None, font: object = None) -
     states = by_unit("state $x$", "x", picture.state_units)
     inputs = by_unit("control $u$", "u", picture.input_units) if picture.input_units else []
     with (
-        printed_on(Paper.chosen("LoopResult.figure", "", width, font)),
+        printed_on(FigurePaper.chosen("LoopResult.figure", "", width, font)),
         panels(len(states) + len(inputs) + 1) as (figure, grid),
     ):
         left, titles = iter(grid), []

@@ -62,7 +62,7 @@ _HIGHEST = 9.0  # inches of all panels: a page
 _STRIP, _TALL = 1.35, 2.0  # inches that it is high, in one column and in several
 
 
-class Paper(NamedTuple):
+class FigurePaper(NamedTuple):
     """What a figure is printed on: its width and the type of all its texts."""
 
     width: float = 7.2  # inches: both columns of a paper; one is 3.4
@@ -70,7 +70,7 @@ class Paper(NamedTuple):
     family: str = "sans-serif"
 
     @classmethod
-    def of(cls, figures: object) -> Paper:
+    def of(cls, figures: object) -> FigurePaper:
         """Return the paper of the setting `figures`: true, false, or `draw`, `width` and `font`.
 
         Raises:
@@ -86,7 +86,7 @@ class Paper(NamedTuple):
         return cls.chosen(COMMAND_LINE, "figures.", figures.get("width"), figures.get("font"))
 
     @classmethod
-    def chosen(cls, name: str, prefix: str, width: object = None, font: object = None) -> Paper:
+    def chosen(cls, name: str, prefix: str, width: object = None, font: object = None) -> FigurePaper:
         """Return the paper of a width in inches and a font: `9`, `serif`, or `9 Times New Roman`.
 
         Args:
@@ -135,14 +135,14 @@ def draws(figures: object) -> bool:
     """Return whether the setting `figures` asks for figures.
 
     Raises:
-        ValueError: as `Paper.of`.
+        ValueError: as `FigurePaper.of`.
     """
-    Paper.of(figures)
+    FigurePaper.of(figures)
     return figures is True or (isinstance(figures, Mapping) and bool(figures.get("draw", True)))
 
 
-_DEFAULT = Paper()
-_PAPER: ContextVar[Paper] = ContextVar("_PAPER", default=_DEFAULT)
+_DEFAULT = FigurePaper()
+_PAPER: ContextVar[FigurePaper] = ContextVar("_PAPER", default=_DEFAULT)
 _KEPT: ContextVar[list[Any] | None] = ContextVar("_KEPT", default=None)
 _WANTED: ContextVar[list[Wanted]] = ContextVar("_WANTED")
 
@@ -155,7 +155,7 @@ def _number(value: object) -> float | None:
 
 
 @contextlib.contextmanager
-def printed_on(paper: Paper) -> Iterator[None]:
+def printed_on(paper: FigurePaper) -> Iterator[None]:
     """Print all figures that are drawn meanwhile on this paper."""
     token = _PAPER.set(paper)
     try:

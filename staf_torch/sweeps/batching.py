@@ -22,7 +22,7 @@ from ..experiments.registry import (
     check_animation,
     experiment,
 )
-from ..figures.style import Paper, printed_on
+from ..figures.style import FigurePaper, printed_on
 from ..results.progress import SHOWN, Progress
 from ..settings.plain import to_read
 from ..settings.suggestions import without_setting
@@ -170,7 +170,7 @@ def completion(cfg: DictConfig, outcome: Outcome) -> Experiment:
         Exception: that of a job that failed, or ValueError for an animation that the experiment has not.
     """
     check_animation(cfg)
-    paper, study = Paper.of(cfg.figures), experiment(cfg.task)
+    paper, study = FigurePaper.of(cfg.figures), experiment(cfg.task)
 
     def left(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
         with printed_on(paper):

@@ -19,7 +19,7 @@ from hydra.experimental.callback import Callback
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from ..figures.style import Paper, draws, printed_on
+from ..figures.style import FigurePaper, draws, printed_on
 from ..numerics import COMMAND_LINE, fail
 from ..results import run_record as records
 from ..results.files import COMPLETED, PAGE, ROWS
@@ -153,7 +153,7 @@ class SweepReport(Callback):
         try:
             chosen = True if chosen is None else chosen
             figures = draws(chosen) if self._figures is None else self._figures
-            with printed_on(Paper.of(chosen)):
+            with printed_on(FigurePaper.of(chosen)):
                 text = write_report(directory, figures=figures)
         except OSError as error:  # a full disk, a directory that has gone
             raise SystemExit(f"staf: no report of the sweep: {sentence(error)}") from error

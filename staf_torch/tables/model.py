@@ -146,7 +146,7 @@ def json_text(table: Table) -> str:
     Example:
         >>> done = sweep("centers.radius=0.1,0.2", "duration=0.1", "settle_time=0", "figures=false")
         >>> json_text(done.table(metrics=("ball_error",))).count("directory")
-        3
+        2
 
         Shown by `staf-table runs --format json`.
     """

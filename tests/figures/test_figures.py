@@ -22,7 +22,7 @@ from PIL import Image
 from staf_torch import figures
 from staf_torch.figures.chase import ConvergenceCurve, draw_convergence
 from staf_torch.figures.style import (
-    Paper,
+    FigurePaper,
     colour,
     curves,
     dash,
@@ -57,7 +57,7 @@ def test_the_style_is_ours_whatever_the_caller_has_set_and_is_taken_back() -> No
 def test_in_a_column_a_figure_has_type_of_8_pt_and_legends_in_its_axes_of_lines_that_are_seen(
     name: str,
 ) -> None:
-    with printed_on(Paper.of({"width": 3.4})):
+    with printed_on(FigurePaper.of({"width": 3.4})):
         figure = FIGURES[name]().figure
     width, height = figure.get_size_inches()
     assert width == 3.4
@@ -93,10 +93,10 @@ def _seen(part: Any) -> bool:
 @pytest.mark.parametrize(
     ("figures", "paper"),
     [
-        (True, Paper()),
-        ({"width": 3.4, "font": 9}, Paper(3.4, 9.0)),
-        ({"font": "serif"}, Paper(family="serif")),
-        ({"width": 5, "font": "7.5 DejaVu Sans"}, Paper(5.0, 7.5, "DejaVu Sans")),
+        (True, FigurePaper()),
+        ({"width": 3.4, "font": 9}, FigurePaper(3.4, 9.0)),
+        ({"font": "serif"}, FigurePaper(family="serif")),
+        ({"width": 5, "font": "7.5 DejaVu Sans"}, FigurePaper(5.0, 7.5, "DejaVu Sans")),
         ({"width": 1.0}, "figures.width=...` must be inches, from 2 to 40; got 1.0"),
         ({"width": "wide"}, "figures.width"),
         ({"width": float("nan")}, "figures.width"),
@@ -107,16 +107,16 @@ def _seen(part: Any) -> bool:
         ("maybe", "figures"),
     ],
 )
-def test_a_width_and_a_font_are_read_as_written_or_refused(figures: object, paper: Paper | str) -> None:
-    if isinstance(paper, Paper):
-        assert Paper.of(figures) == paper
+def test_a_width_and_a_font_are_read_as_written_or_refused(figures: object, paper: FigurePaper | str) -> None:
+    if isinstance(paper, FigurePaper):
+        assert FigurePaper.of(figures) == paper
         return
     with pytest.raises(ValueError, match=re.escape(paper)):
-        Paper.of(figures)
+        FigurePaper.of(figures)
 
 
 def plain() -> Figure:
-    with printed_on(Paper(3.0)), page(2.0) as figure:
+    with printed_on(FigurePaper(3.0)), page(2.0) as figure:
         axes = figure.subplots()
         axes.plot([0, 1], [1, 2], label="a")
         axes.set_ylabel("a long name\nin three\nlines")
@@ -127,7 +127,7 @@ def test_a_page_is_laid_out_once_with_room_for_its_names() -> None:
     figure = plain()
     (axes,) = figure.axes
     place = axes.get_position().bounds
-    with printed_on(Paper(3.0)), page(2.0) as other:
+    with printed_on(FigurePaper(3.0)), page(2.0) as other:
         other.subplots().plot([0, 1], [1, 2])
     assert place[0] > other.axes[0].get_position().x0 + 0.05
     with matplotlib.rc_context({"savefig.dpi": 50, "font.size": 30}):  # of the caller's own

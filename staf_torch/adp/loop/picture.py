@@ -142,7 +142,7 @@ def picture(result: LoopResult, rows: Sequence[int] | None, lqr: bool) -> LoopPi
         words = f"{about.plant}, {about.controller}"
     if len(chosen) < count:
         words += f", {len(chosen)} of {count} rows"
-    none = torch.full((inputs,), math.inf)
+    none = torch.full((inputs,), math.inf, dtype=torch.float64)
     return LoopPicture(
         *(words, result.time.cpu().numpy(), *_arrays(result, chosen)),
         *(units.of_states(dim)[: dim - clock], units.of_inputs(inputs)),
@@ -155,7 +155,7 @@ def picture(result: LoopResult, rows: Sequence[int] | None, lqr: bool) -> LoopPi
 
 def _arrays(result: LoopResult, rows: Sequence[int]) -> tuple[Any, Any, Any]:
     """State, control and cost of some rows, with gaps where an angle jumps and once a row is frozen."""
-    at = torch.tensor(rows, device=result.state.device)
+    at = torch.tensor(rows, dtype=torch.int64, device=result.state.device)
     state, control, cost = (
         part.index_select(0, at).detach().cpu().double().clone()
         for part in (result.state, result.control, result.running_cost)
