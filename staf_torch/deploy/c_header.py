@@ -6,7 +6,6 @@ import ctypes
 import os
 import re
 import shutil
-import subprocess
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -17,6 +16,7 @@ from torch import Tensor, nn
 from ..adp import Controller
 from ..lanes import Program
 from ..lanes.call import Given
+from ..lanes.compiler import run
 from ..lanes.emit.c import commented
 from ..lanes.emit.identifiers import checked_names, guarded
 from ..lanes.trace.graph import WIDE
@@ -310,7 +310,7 @@ def _built(path: Path, function: str, head: str = "") -> Callable[..., object]:
         source = f'{head}#include "exported.h"\n{function}\n'
         (Path(folder) / "call.c").write_text(source, encoding="utf-8")
         line = [need_c_compiler(), "-O2", "-shared", "-fPIC", "-x", "c", "call.c", "-o", "call.so", "-lm"]
-        subprocess.run(line, cwd=folder, check=True, capture_output=True)
+        run(line, folder=Path(folder))
         return ctypes.CDLL(str(Path(folder) / "call.so")).call
 
 

@@ -17,11 +17,12 @@ import os
 import pickle
 import platform
 import shutil
+import stat
 import sys
 import tempfile
 import time
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
 from operator import is_
 from pathlib import Path
@@ -36,11 +37,16 @@ from .emit.cpp import Text
 from .trace.captured_tensors import Recipe
 from .trace.captured_tensors import tensors as tensors_of
 
+try:
+    import fcntl
+except ImportError:  # no POSIX
+    fcntl = None  # type: ignore[assignment]
+
 _log = logging.getLogger(__name__)
 LARGEST = 2**30
 """Bytes that the cache may hold: a trace is some 15 kilobytes, a library 30."""
 _SCRATCH = tempfile.gettempprefix()  # of names under which a file is written at first
-_DAY = 86_400.0
+_BEGUN, _HOUR, _DAY = 1.0, 3600.0, 86_400.0
 _LONGEST_UNUSED = 60 * _DAY
 _temporary: dict[int, Path] = {}  # caches, by the process that made them
 _FOLDER = Path(__file__).parent.parent
@@ -83,15 +89,16 @@ def place(*described: object) -> Path:
 def load(path: Path, tensors: Sequence[Tensor]) -> Trace | None:
     """Return a trace with the numbers that follow from other tensors, as `save` had them; None without."""
     try:
+        path = next(found(path.name), path)
         content = path.read_bytes()
         used(path)
         if content[-_DIGEST:] != hashlib.sha256(content[:-_DIGEST]).digest():
             return None
-        found = Trace(*_TraceReader(io.BytesIO(zlib.decompress(content[:-_DIGEST])), tensors).load())
+        trace = Trace(*_TraceReader(io.BytesIO(zlib.decompress(content[:-_DIGEST])), tensors).load())
     except _DAMAGED:
         return None
-    numbers = found.recipe.again({id(tensor): tensor for tensor in tensors})
-    return None if numbers is None else found._replace(recipe=found.recipe._replace(values=numbers))
+    numbers = trace.recipe.again({id(tensor): tensor for tensor in tensors})
+    return None if numbers is None else trace._replace(recipe=trace.recipe._replace(values=numbers))
 
 
 def save(path: Path, trace: Trace, tensors: Sequence[Tensor]) -> None:
@@ -105,9 +112,9 @@ def save(path: Path, trace: Trace, tensors: Sequence[Tensor]) -> None:
         _TraceWriter(file, places, numberless).dump(tuple(trace._replace(recipe=numberless)))
         content = zlib.compress(file.getvalue(), level=1)  # 100 kilobytes to 15
         # Under a name of its own first: another process may be writing the same.
-        with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as scratch:
-            scratch.write(content + hashlib.sha256(content).digest())
-        os.replace(scratch.name, path)
+        with scratch(path.parent) as folder:
+            (folder / path.name).write_bytes(content + hashlib.sha256(content).digest())
+            publish(folder / path.name, path)
     except (OSError, pickle.PicklingError, TypeError, AttributeError):
         return  # it is traced again another time
 
@@ -184,20 +191,103 @@ class _TraceReader(pickle.Unpickler):
 
 
 def cache() -> Path:
-    """Return the folder of libraries and traces: in `XDG_CACHE_HOME`, else in ``~/.cache``.
+    """Return the folder to which libraries and traces are written: in `XDG_CACHE_HOME`, else in ``~/.cache``.
 
-    Where nothing may be written there, a folder that goes with the process.
+    Where nothing may be written there, or somebody else may write, a folder that goes with the process.
     """
-    home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    folder = Path(home) / "staf_torch"
+    folder = _home()
+    if folder is None or not os.access(folder, os.W_OK):
+        return _cache_of_the_process()
+    _pruned(folder)
+    return folder
+
+
+def found(pattern: str) -> Iterator[Path]:
+    """Yield the files of a name, or a pattern of names, that may be read from the caches, in their order."""
+    for folder in filter(None, (_home(), _temporary.get(os.getpid()))):
+        for path in sorted(folder.glob(pattern)):
+            if not _refused(path):
+                yield path
+
+
+def _home() -> Path | None:
+    """Return the user's own cache, None where there is none, or somebody else may write to it."""
+    home = os.environ.get("XDG_CACHE_HOME", "")
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if os.access(folder, os.W_OK):
-            _pruned(folder)
-            return folder
+        folder = Path(home if os.path.isabs(home) else Path.home() / ".cache") / "staf_torch"
+        with contextlib.suppress(OSError):  # it may be there and not ours to write
+            folder.mkdir(mode=_OURS, parents=True, exist_ok=True)
+        return None if not folder.is_dir() or _refused(folder) else folder
+    except (OSError, RuntimeError):  # a folder that may not be looked into, a user without a home
+        return None
+
+
+def _refused(path: Path) -> bool:
+    """Return whether somebody but this user and root may have written a file or folder, and say so."""
+    if not hasattr(os, "geteuid"):
+        return False
+    try:
+        state = path.stat()
     except OSError:
-        pass
-    return _cache_of_the_process()
+        return True
+    wrong = f"it belongs to user {state.st_uid}" if state.st_uid not in (os.geteuid(), 0) else ""
+    if state.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        wrong = f"others than its owner may write to it (mode {stat.S_IMODE(state.st_mode):o})"
+    if wrong and path not in _told:
+        _told.add(path)
+        told = "%s is not used, as machine code is run from there: %s. Remove it, or set XDG_CACHE_HOME"
+        _log.warning(told, path, wrong)
+    return bool(wrong)
+
+
+_told: set[Path] = set()
+_OURS = 0o755  # also where the user's umask lets a group write
+
+
+@contextlib.contextmanager
+def scratch(folder: Path) -> Iterator[Path]:
+    """Context: a folder in a cache where a file is made; it is gone in the end, at the latest for `prune`.
+
+    It is locked as long as this process lives: one that nobody locks was left by a process that was killed.
+    """
+    with tempfile.TemporaryDirectory(dir=folder) as place:
+        lock = os.open(place, os.O_RDONLY)
+        try:
+            _lock(lock)
+            yield Path(place)
+        finally:
+            os.close(lock)
+
+
+def publish(made: Path, path: Path) -> None:
+    """Give a file its name in the cache, where nobody else may write to it."""
+    made.chmod(_OURS & (made.stat().st_mode | stat.S_IWUSR))
+    os.replace(made, path)
+
+
+def _lock(file: int) -> bool | None:
+    """Lock an open file or folder: False where somebody else has, None where the file system cannot."""
+    if fcntl is None:
+        return None
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return None
+    return True
+
+
+def _left_over(path: Path, age: float) -> bool:
+    """Return whether the process that made a scratch folder or file has been killed."""
+    if not path.is_dir() or age < _BEGUN:
+        return age > _HOUR
+    file = os.open(path, os.O_RDONLY)
+    try:
+        free = _lock(file)
+    finally:
+        os.close(file)
+    return age > _DAY if free is None else free
 
 
 def used(path: Path) -> None:
@@ -210,7 +300,8 @@ def prune(folder: Path, *, now: float | None = None, largest: int = LARGEST) -> 
     """Delete files of the cache that nobody has used for long, and the oldest while there are too many bytes.
 
     What was used within a day stays in any case: another process may be about to load it. A library that a
-    process has loaded stays with that process. Names that this library did not give are left alone.
+    process has loaded stays with that process. Names that this library did not give are left alone. What a
+    compiler or a process has left that was killed goes at once.
 
     Args:
         folder: of the cache.
@@ -226,13 +317,18 @@ def prune(folder: Path, *, now: float | None = None, largest: int = LARGEST) -> 
                 found.append((state.st_mtime, state.st_size, path))
     kept = sum(size for _, size, _ in found)
     for last_use, size, path in sorted(found):
-        unused, left_over = now - last_use, path.name.startswith(_SCRATCH)  # by a process that was killed
-        if unused > _LONGEST_UNUSED or (unused > _DAY and (left_over or kept > largest)):
-            kept -= size
-            if path.is_dir():
-                shutil.rmtree(path, ignore_errors=True)
-            else:
-                path.unlink(missing_ok=True)
+        unused = now - last_use
+        if path.name.startswith(_SCRATCH):
+            with contextlib.suppress(OSError):
+                if not _left_over(path, unused):
+                    continue
+        elif unused <= _LONGEST_UNUSED and (unused <= _DAY or kept <= largest):
+            continue
+        kept -= size
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
 
 
 @functools.cache

@@ -7,17 +7,18 @@ import ctypes
 import functools
 import hashlib
 import logging
+import math
 import os
 import platform
+import re
 import shlex
 import shutil
 import signal
 import subprocess
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from .cache import cache, used
+from .cache import cache, found, publish, scratch, used
 from .locks import Mutex
 
 COMPILERS = ("g++", "c++", "clang++")
@@ -83,30 +84,44 @@ def machine_code(text: str) -> Callable[..., None]:
 
 
 def _library(name: str, text: str, options: tuple[str, ...], folder: Path) -> Path:
-    """Return the path of a shared object, built if it is not in the cache."""
+    """Return the path of a shared object, built if it is not in the cache.
+
+    Its name says what it is made of, and then by which compiler. Where there is no compiler, the machine code
+    of any other serves, as in a container to which a cache was copied.
+    """
+    parts = (text, *options, *_surroundings(folder))
+    made_of = f"{name}-{_digest(*parts)[:24]}"
     program = find_compiler()
     if program is None:
-        raise FileNotFoundError(f"none of {', '.join(COMPILERS)} is on the path")
+        for path in found(f"{made_of}-*.so"):
+            if _is_whole(path):
+                return path
+        raise FileNotFoundError(f"none of {', '.join(COMPILERS)} is on the path, and no cache has it")
     lines, of_user = text.count("\n"), shlex.split(os.environ.get("CXXFLAGS", ""))
     # Clang, which also answers to the name of g++, knows none of these.
     if name == "lanes" and lines > _LONG and "clang" not in _version(program).lower():
         options = (*options, *_OF_LONG)
     command = [program, *options, *of_user, *(f"-I{each}" for each in dict.fromkeys((folder, _FOLDER)))]
-    parts = (text, *options, *of_user, *_surroundings(program, folder))
-    digest = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
-    path = cache() / f"{name}-{digest}.so"
-    if not _is_whole(path):
-        if lines > _SLOW:
-            _log.warning("a program of %d lines is compiled, once: some %.0f s", lines, lines / 1600)
-        # Under a name of its own first: another process may be building the same.
-        with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
-            source, built = Path(scratch) / f"{name}.cpp", Path(scratch) / path.name
-            source.write_text(text, encoding="utf-8")
-            _run([*command, str(source), "-o", str(built)])
-            with built.open("ab") as file:  # a digest, which a loader of shared objects does not look at
-                file.write(hashlib.sha256(built.read_bytes()).digest())
-            os.replace(built, path)
+    file = f"{made_of}-{_digest(*options, *of_user, _version(program))[:8]}.so"
+    for path in found(file):
+        if _is_whole(path):
+            return path
+    if lines > _SLOW:
+        _log.warning("a program of %d lines is compiled, once: some %.0f s", lines, lines / 1600)
+    # In a folder of its own first: another process may be building the same.
+    path = cache() / file
+    with scratch(path.parent) as place:
+        source, built = place / f"{name}.cpp", place / path.name
+        source.write_text(text, encoding="utf-8")
+        run([*command, str(source), "-o", str(built)], short=lines < _SLOW)
+        with built.open("ab") as shared:  # a digest, which a loader of shared objects does not look at
+            shared.write(hashlib.sha256(built.read_bytes()).digest())
+        publish(built, path)
     return path
+
+
+def _digest(*parts: str) -> str:
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 
 def _is_whole(library: Path) -> bool:
@@ -120,14 +135,21 @@ def _is_whole(library: Path) -> bool:
 
 
 @functools.cache
-def _surroundings(program: str, folder: Path) -> tuple[str, ...]:
-    """Return what machine code depends on beside text and options: headers, the compiler, the processor.
+def _surroundings(folder: Path) -> tuple[str, ...]:
+    """Return what machine code depends on beside text and options: headers, the C library, the processor.
 
-    Not where the sources lie: two checkouts of one version share what is built.
+    Not where the sources lie: two checkouts of one version share what is built. Nor the system's kernel: a
+    container meets many.
     """
     headers = {file.name: file for each in (_FOLDER, folder) for file in each.glob("_*.hpp")}
     texts = (headers[name].read_text(encoding="utf-8") for name in sorted(headers))
-    return *texts, _version(program), platform.platform(), _processor()
+    return *texts, platform.system(), platform.machine(), *platform.libc_ver(), _processor()
+
+
+_VECTORS = re.compile(
+    r"\b(?:avx|ss?se|fma|f16c|bmi|abm|popcnt|movbe|aes|vaes|p?clmul|vpclmul|gfni|sha|adx|amx)\w*"
+)
+"""Of an x86's flags those by which code is chosen: the others also change with the system's kernel."""
 
 
 def _processor() -> str:
@@ -136,7 +158,9 @@ def _processor() -> str:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
         return platform.processor()
-    return "\n".join(sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))}))
+    told = {line for line in lines if line.startswith(("model name", "Features"))}
+    told |= {" ".join(sorted(set(_VECTORS.findall(line)))) for line in lines if line.startswith("flags")}
+    return "\n".join(sorted(told))
 
 
 def find_compiler() -> str | None:
@@ -146,33 +170,69 @@ def find_compiler() -> str | None:
 
 @functools.cache
 def compiler() -> str:
-    """Return the first line of what the compiler says of its version; empty where there is none."""
+    """Return the first line of what the compiler says of its version; empty where none answers."""
     program = find_compiler()
-    return "" if program is None else _version(program).partition("\n")[0]
+    try:
+        return "" if program is None else _version(program).partition("\n")[0]
+    except OSError:
+        return ""
 
 
 @functools.cache
 def _version(program: str) -> str:
-    return _run([program, "--version"])
+    return run([program, "--version"])
 
 
-def _run(command: list[str]) -> str:
-    seconds = float(os.environ.get("STAF_COMPILE_SECONDS", "120"))
-    pipe = subprocess.PIPE
-    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, process_group=0) as process:
+def seconds() -> float:
+    """Return what a build may take, `STAF_COMPILE_SECONDS`, 120 by default.
+
+    Raises:
+        OSError: if that is no positive number.
+    """
+    given = os.environ.get("STAF_COMPILE_SECONDS", "120")
+    try:
+        found = float(given)
+    except ValueError:
+        found = math.nan
+    if not 0 < found < math.inf:
+        raise OSError(f"`STAF_COMPILE_SECONDS` must be a positive number; got {given!r}")
+    return found
+
+
+def run(command: list[str], *, short: bool = True, folder: Path | None = None) -> str:
+    """Return what a compiler prints.
+
+    Args:
+        command: program and arguments.
+        short: whether it takes seconds at most. One that does not end is not called again by this process.
+        folder: where it runs.
+
+    Raises:
+        OSError: if it fails, or does not end in time.
+    """
+    if command[0] in _hanging:
+        raise OSError(f"{command[0]} did not end before")
+    limit, pipe = seconds(), subprocess.PIPE
+    with subprocess.Popen(
+        command, stdout=pipe, stderr=pipe, text=True, process_group=0, cwd=folder
+    ) as process:
         try:
-            out, err = process.communicate(timeout=seconds)
+            out, err = process.communicate(timeout=limit)
         except BaseException as error:
             with contextlib.suppress(ProcessLookupError):  # it has just ended
                 os.killpg(
                     process.pid, signal.SIGKILL
                 )  # with what the driver has started, which works on else
             if isinstance(error, subprocess.TimeoutExpired):
-                raise OSError(f"{command[0]} took more than {seconds:g} s (STAF_COMPILE_SECONDS)") from error
+                _hanging.update([command[0]] if short else ())
+                raise OSError(f"{command[0]} took more than {limit:g} s (STAF_COMPILE_SECONDS)") from error
             raise
     if process.returncode != 0:
         raise OSError(f"{command[0]} failed: {err.strip() or process.returncode}")
     return out
+
+
+_hanging: set[str] = set()
 
 
 def _say(name: str, reason: str) -> None:
@@ -180,4 +240,4 @@ def _say(name: str, reason: str) -> None:
         first = name not in _said
         _said.add(name)
     if first:
-        _log.warning("the %s of a chase runs in plain torch, slower: nothing compiled (%s)", name, reason)
+        _log.warning("no compiled %s: plain torch or one thread serves, slower (%s)", name, reason)

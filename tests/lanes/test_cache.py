@@ -6,7 +6,10 @@ import ctypes
 import itertools
 import multiprocessing
 import os
+import platform
+import re
 import shutil
+import signal
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -47,6 +50,11 @@ def right(program: lanes.Program) -> None:
     torch.testing.assert_close(program(X, steps=2), program.definition(X, steps=2))
 
 
+def programs(cache: Path) -> list[Path]:
+    """What a cache holds, but for the library of threads that all programs share."""
+    return [path for path in cache.iterdir() if not path.name.startswith("threads-")]
+
+
 def in_children(*functions: Callable[[], Any]) -> None:
     """Run functions in processes of their own, side by side: what one of them loads no other has."""
     context = multiprocessing.get_context("fork")
@@ -77,7 +85,8 @@ def calls(cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Calla
     log, own = tmp_path / "log", compiler.find_compiler()
     noting = script(tmp_path / "noting", f'echo "$@" >> {log}', f'exec {own} "$@"')
     monkeypatch.setenv("CXX", str(noting))
-    return lambda: [line for line in log.read_text().splitlines() if " -o " in line] if log.exists() else []
+    noted = lambda: log.read_text().splitlines() if log.exists() else []  # noqa: E731
+    return lambda: [line for line in noted() if " -o " in line and "/threads-" not in line]
 
 
 def test_a_program_is_built_once_for_all_processes(cache: Path, calls: Callable[[], Sequence[str]]) -> None:
@@ -88,13 +97,13 @@ def test_a_program_is_built_once_for_all_processes(cache: Path, calls: Callable[
     right(lanes.Program(program.step, name="another of the same text"))
     (command,) = calls()
     assert {"-march=native", "-ffp-contract=off"} <= {*command.split()}  # rounding is as it is written down
-    assert [path.suffix for path in cache.iterdir()] == [".so"]  # and nothing is left beside it
+    assert [path.suffix for path in programs(cache)] == [".so"]  # and nothing is left beside it
 
 
 def test_processes_that_build_the_same_at_once_do_not_disturb_each_other(cache: Path) -> None:
     program = new_program()
     in_children(*[lambda: right(program)] * 2)
-    assert [path.suffix for path in cache.iterdir()] == [".so"]
+    assert [path.suffix for path in programs(cache)] == [".so"]
 
 
 def test_other_options_and_another_compiler_are_another_library(
@@ -124,7 +133,7 @@ def test_a_damaged_library_is_built_again_and_never_loaded(
 ) -> None:
     program = new_program()
     in_children(lambda: right(program))
-    (path,) = cache.iterdir()
+    (path,) = programs(cache)
     whole = path.read_bytes()
     for count, damage in enumerate(DAMAGES.values(), start=2):
         path.write_bytes(damage(whole))
@@ -138,6 +147,10 @@ FAULTS: dict[str, tuple[dict[str, str], str]] = {
     "a compiler that fails": ({"CXX": "/bin/false"}, "failed"),
     "a compiler that refuses the text": ({"CXXFLAGS": "-include no_such_file.hpp"}, "no_such_file.hpp"),
     "a compiler that hangs": ({"STAF_COMPILE_SECONDS": "0.2"}, "took more than 0.2 s"),
+    "a limit that is none": (
+        {"STAF_COMPILE_SECONDS": "2m"},
+        "`STAF_COMPILE_SECONDS` must be a positive number",
+    ),
 }
 
 
@@ -175,6 +188,74 @@ def test_what_a_compiler_that_takes_too_long_has_started_ends_with_it(
     while state.exists() and state.read_text().split()[2] != "Z" and time.monotonic() < deadline:
         time.sleep(0.01)
     assert not state.exists() or state.read_text().split()[2] == "Z"
+    begun = time.monotonic()
+    assert not new_program("another program").compiles(X, steps=2)  # it is not waited for again
+    assert time.monotonic() - begun < 0.4
+
+
+def test_a_cache_serves_where_there_is_no_compiler_also_one_that_nobody_may_write(
+    cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A container to which a cache was copied, of another compiler's and with other flags, on any kernel."""
+    program, never_built = new_program(), new_program("a program that was never built")
+    in_children(lambda: right(program))
+    monkeypatch.setenv("PATH", "/nonexistent")
+    monkeypatch.delenv("CXXFLAGS")
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    monkeypatch.setattr(platform, "platform", lambda: "another kernel")
+    in_children(lambda: right(program))
+    assert not never_built.compiles(X, steps=2)
+    (library,) = programs(cache)
+    library.write_bytes(DAMAGES["half"](library.read_bytes()))
+    assert not lanes.Program(program.step, name="a program that was damaged").compiles(X, steps=2)
+
+
+FOREIGN: dict[str, tuple[Callable[[Path], None], str]] = {
+    "that others may write": (lambda path: path.chmod(0o777), r"others than its owner .*\(mode 777\)"),
+    "of another user": (lambda path: os.chown(path, 4321, -1), "it belongs to user 4321"),
+}
+
+
+@pytest.mark.parametrize("kind", FOREIGN)
+def test_nothing_is_loaded_that_somebody_else_may_have_written(
+    kind: str, cache: Path, caplog: pytest.LogCaptureFixture, calls: Callable[[], Sequence[str]]
+) -> None:
+    if "user" in kind and os.geteuid() != 0:
+        pytest.skip("only root can give a file away")
+    change, reason = FOREIGN[kind]
+    program = new_program()
+    in_children(lambda: right(program))
+    (library,) = programs(cache)
+    assert library.stat().st_mode & 0o022 == 0
+    change(library)
+    right(program)  # from a library of its own
+    assert len(calls()) == 2
+    assert [path.stat().st_uid for path in programs(cache)] == [os.geteuid()]
+    change(cache)
+    before = {path: path.stat().st_mtime_ns for path in cache.iterdir()}
+    right(new_program())
+    assert folder_of.cache() != cache
+    assert {path: path.stat().st_mtime_ns for path in cache.iterdir()} == before
+    for line, path in zip(caplog.messages, (library, cache), strict=True):
+        assert re.match(rf"{path} is not used, as machine code is run from there: {reason}", line)
+
+
+def test_what_a_killed_process_left_is_swept_and_what_one_builds_now_is_not(cache: Path) -> None:
+    folder = folder_of.cache()
+
+    def killed() -> None:
+        with folder_of.scratch(folder):
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    child = multiprocessing.get_context("fork").Process(target=killed)
+    child.start()
+    child.join(60)
+    (left,) = folder.iterdir()
+    with folder_of.scratch(folder) as ours:
+        folder_of.prune(folder)  # too young: it may be about to be locked
+        folder_of.prune(folder, now=time.time() + 5)
+        assert list(folder.iterdir()) == [ours]
+        assert left != ours
 
 
 def test_a_home_that_cannot_be_written_is_replaced_by_a_folder_of_the_process(
@@ -185,8 +266,9 @@ def test_a_home_that_cannot_be_written_is_replaced_by_a_folder_of_the_process(
     folder = folder_of.cache()
     assert folder == folder_of.cache()  # what one program leaves there another one finds
     assert not folder.is_relative_to(tmp_path)
+    before = set(folder.iterdir())
     right(new_program())
-    assert len(list(folder.glob("lanes-*.so"))) == 1
+    assert len(set(folder.iterdir()) - before) == 1
     shutil.rmtree(folder)  # somebody tidies up
     assert folder_of.cache().is_dir()
 
@@ -274,7 +356,7 @@ def test_the_cache_forgets_what_nobody_has_used_and_nothing_of_today(tmp_path: P
 def test_what_is_in_use_is_noted_so_that_it_stays(cache: Path) -> None:
     program = new_program()
     in_children(lambda: right(program))
-    (path,) = cache.iterdir()
+    (path,) = programs(cache)
     os.utime(path, (1e9, 1e9))
     right(program)
     assert path.stat().st_mtime > 1e9 + 1
