@@ -44,6 +44,7 @@ NEEDS = {  # what some options cannot do without, or that makes them small
     "centers=directions": ["centers.directions=[[0,1],[1,0],[-1,0]]"],
     "system=cart_pole": ["centers=simplex", "target=quadratic", "initial_state=[0.1,0,0,0]"],
     "system=planar_quadrotor": ["centers=simplex", "target=quadratic", "initial_state=[0.1,0,0,0,0,0]"],
+    "experiment=adp_as_printed": ["duration=0.005"],
     "experiment=adp_policy_iteration": ["duration=0.01"],
     "system=two_link_robot": ["centers=simplex", "target=quadratic", "initial_state=[0.1,0,0,0]"],
     "system=three_state": ["centers=simplex", "target=quadratic", "initial_state=[0.1,0,0]"],

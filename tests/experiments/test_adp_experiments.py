@@ -24,7 +24,7 @@ SHORT = ("experiment=adp", "duration=0.1", "dt=0.005", "figures=false")
 @pytest.mark.parametrize(
     "overrides",
     [
-        ["adp/law=published", "dt=0.001", "duration=0.01", "adp.gradient=partial"],
+        ["adp/law=published", "dt=0.001", "duration=0.004", "adp.gradient=partial"],
         ["adp/policy=rollout", "adp.rollout.depth=1", "dt=0.02"],
         ["adp/policy=none", "trajectories=3"],
         ["system=two_state_as_printed", "adp.optimum.shooting=false"],
@@ -37,7 +37,7 @@ SHORT = ("experiment=adp", "duration=0.1", "dt=0.005", "figures=false")
         ],
         ["adp.extrapolated_centers=fixed", "adp.trust=0.5", "dt=0.02"],
         ["adp/policy=lqr", "system=pendulum", "adp.optimum.horizon=2.5", "adp.optimum.intervals=40"],
-        ["experiment=adp_three_state", "duration=0.05"],
+        ["experiment=adp_three_state", "duration=0.02"],
     ],
     ids=" ".join,
 )

@@ -39,7 +39,7 @@ def path(rate: float, wrapped: bool):  # type: ignore[no-untyped-def]
 
 
 @pytest.mark.parametrize(
-    ("rate", "wrapped", "steps"), [(0.5, False, 70), (2.0, True, 20), (100.0, False, 20)]
+    ("rate", "wrapped", "steps"), [(1.0, False, 35), (2.0, True, 20), (100.0, False, 20)]
 )
 def test_a_path_that_turns_by_more_than_half_a_turn_is_followed_at_no_cost(
     rate: float, wrapped: bool, steps: int

@@ -252,7 +252,7 @@ def test_a_period_of_a_billion_steps_is_answered_at_once() -> None:
     assert found.spectral_radius == pytest.approx(0.3 * float(rest[0]))
 
 
-@pytest.mark.parametrize("period", [10.0, 1000.0, 1e5])
+@pytest.mark.parametrize("period", [10.0, 1e5])
 def test_a_loop_that_overflows_within_a_period_is_unstable_and_told(
     period: float, caplog: pytest.LogCaptureFixture
 ) -> None:
