@@ -52,10 +52,6 @@ JOBS = {
         *("sweep.records=table", "hydra.sweep.dir=runs/s"),
     ],
     "one fails": ["-m", CONF, "experiment=squares", "seed=6,7", "hydra.sweep.dir=runs/s"],
-    "elsewhere": [
-        *("-m", CONF, "experiment=squares", "seed=1,2", "hydra.sweep.dir=runs/s"),
-        *("hydra.launcher.executor=process", "hydra.launcher.workers=1"),
-    ],
     "no experiment": ["task=plants.number"],
 }
 
@@ -89,15 +85,7 @@ def test_a_function_is_swept_and_has_a_table(outcomes: dict[str, Outcome]) -> No
     assert "energy" in (sweep / "table.csv").read_text()
 
 
-def test_a_class_shares_a_tensor_batch_in_another_process_too(outcomes: dict[str, Outcome]) -> None:
-    assert outcomes["elsewhere"].code == 0, outcomes["elsewhere"]
-    sweep = outcomes["elsewhere"].folder / "runs" / "s"
-    found = [metrics(sweep / str(num)) for num in range(2)]
-    assert found == [{"square": 1.0, "together": 2.0}, {"square": 4.0, "together": 2.0}]
-    assert "square" in (sweep / "table.csv").read_text()
-
-
-def test_rows_of_a_table_share_it_too(outcomes: dict[str, Outcome]) -> None:
+def test_a_class_shares_a_tensor_batch(outcomes: dict[str, Outcome]) -> None:
     assert outcomes["rows"].code == 0, outcomes["rows"]
     rows = json.loads((outcomes["rows"].folder / "runs" / "s" / "rows.json").read_text())["rows"]
     assert [row["metrics"]["square"] for row in rows] == [0.0, 1.0, 4.0, 9.0]
