@@ -21,8 +21,8 @@ ROOT = Path(__file__).resolve().parent.parent
 TOOLS = "pytest>=8 pytest-xdist>=3.6 pytest-cov>=7 hypothesis>=6.100 mpmath>=1.3 hatchling>=1.25"
 EXTRAS = "scipy>=1.11 gymnasium>=1.1 gmpy2>=2.1"
 FURTHER = "onnx onnxscript onnxruntime casadi"
-CORE = "numpy matplotlib jinja2 tqdm"
-LOWEST = "torch==2.6.0 numpy==1.26.0 hydra-core==1.3.8 matplotlib==3.8.0 jinja2==3.1.0 tqdm==4.66.0"
+CORE = "numpy matplotlib jinja2"
+LOWEST = "torch==2.6.0 numpy==1.26.0 hydra-core==1.3.8 matplotlib==3.8.0 jinja2==3.1.0"
 VERSIONS = {
     "lowest": ("3.11", f"{LOWEST} {TOOLS} {EXTRAS}"),
     "python312": ("3.12", f"torch==2.9.1 hydra-core<1.4 {CORE} {TOOLS} {EXTRAS}"),

@@ -17,7 +17,9 @@ from ..kernels import ExponentialKernel
 from ..lanes import ready, where_rows
 from ..lanes.gradients import marked, refuse_gradient, without_gradient
 from ..lanes.opaque import opaque
-from ..numerics.checks import choice, flag, positive_real
+from ..numerics.checks import choice, flag, integer, positive_real
+from ..numerics.shown import shown, sizes
+from ..signs import Sign
 from ..systems import Plant
 from ..systems.bounds import Limit
 from .loop.controller import LQR, Controller, Feedback
@@ -40,6 +42,8 @@ _PLANNED = 3.0  # likewise with plans, which need the end to be nearer to the go
 _STEPS = (12, 60)  # periods in the horizon, at least and at most
 _SHARES = (0.25, 0.5, 1.0, 2.0, 4.0)  # of the spread: boxes of states that a report tries
 _TIMED, _TIMING = (20, 400), 1e5  # controls that are timed: at least, at most; us that are enough
+_STATES, _FEWEST, _WORK = 20, 3, 6e6  # of a report: states, or steps of rollouts that take some seconds
+_SHORTER = 0.75  # of the run, where that is of few states: the slowest mode falls to 1e-3
 _SETTLED = 9.2  # time constants for which the loops of a report run: the slowest mode falls to 1e-4
 _TRIES, _PATIENCE = 8, 1.0  # controls, and s, after which a simulator is called slow
 _SHARE = 0.5  # of a period that a control may take without a warning: another half for a slower moment
@@ -118,6 +122,18 @@ class NearOptimal(SampledRollout):
         planner = self.plans(_PLANNED)
         return Feedback(self) if planner is None else StrainedPlans(self, planner)
 
+    def __repr__(self) -> str:
+        plant, cost, reach = self.plant, self.cost, self.reach
+        way = "the LQR and its rollouts" if self.memory is None else "a global value"
+        known = "" if reach.regulated is None else f", {100 * reach.regulated:.0f} % of it regulated"
+        box = ", ".join(map(shown, reach.box))
+        return (
+            f"NearOptimal({type(plant).__name__}, {sizes(cost.dim, cost.inputs)}, held for "
+            f"{self.period:g} s,\n  {way}: box +-({box}){known},\n  horizon {self.steps * self.period:.4g} s "
+            f"({self.steps} periods), {self.basis.count} centers, plan={self.plan},\n  {cost!r},\n  "
+            f"{self.lqr!r})"
+        )
+
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "_planners": {}}
 
@@ -138,22 +154,34 @@ class NearOptimal(SampledRollout):
             self._planners[key] = BoundedPlans(problem, steps, self)
         return self._planners[key]
 
+    @Sign("policy.report()")
     @torch.no_grad()
     def report(
-        self, *, states: int = 20, spread: float | None = None, optimum: bool = True, seed: int = 0
+        self,
+        *,
+        states: int | None = None,
+        spread: float | None = None,
+        full: bool = False,
+        optimum: bool = False,
+        seed: int = 0,
     ) -> dict[str, Any]:
-        """Report the choices, and the costs from states drawn uniformly around the set-point.
+        """Report the choices, and the costs from states drawn uniformly around the set-point, in ten seconds.
 
         Args:
-            states: how many.
+            states: how many; by default 20, or fewer where loops are long (of 3, they end when the
+                slowest mode of the LQR has fallen to 1e-3, and not to 1e-4).
             spread: half the width of their box, in units of the state, of angles at most pi; by default that
                 of `Reach.box`: the plant's ``spread``, and all angles.
-            optimum: whether to compare with direct shooting, where the plant allows it: that takes the time.
+            full: whether to run ``controller()``, with its plans, to look for ``good_spread``, and to compile
+                the policy and time it: up to some minutes.
+            optimum: whether to compare with direct shooting, where the plant allows it: from seconds for a
+                plant of two states to many minutes for four within bounds.
             seed: of the states.
 
         Returns:
             ``dt``, ``base``, ``centers``, ``radius``, ``horizon`` in s, ``substeps``; ``spectral_radius`` and
-            ``largest_period`` of the held linearised loop; ``reach``, ``local`` or ``global``; ``spread``;
+            ``largest_period`` of the held linearised loop; ``reach``, ``local`` or ``global``; ``spread``,
+            ``states``;
             ``regulated``, the share of the states that end within 1 % of where they began;
             ``over_base_median`` and ``over_base_max``, the cost over the LQR's in the states that both
             regulate; ``over_optimum_median`` and
@@ -162,19 +190,25 @@ class NearOptimal(SampledRollout):
             all are regulated, else of 1/8 to 1/4096, 0 if none; ``microseconds`` a control of one row, the
             median; ``strained``, the share of the states from which the LQR would meet a bound within the
             horizon, where the policy as a function of x is no better than the LQR unless it plans, and its
-            ``controller()`` plans; None without bounds or a plant in torch.
+            ``controller()`` plans; None without bounds or a plant in torch; ``left_out``, what is None
+            because it was not asked for, and how to ask for it.
         """
         width = positive_real("report", "spread", self.plant.spread if spread is None else spread)
-        x0 = drawn(self.cost, self.box if spread is None else self._box(width), states, seed)
+        count = self._few() if states is None else integer("report", "states", states, least=1)
+        x0 = drawn(self.cost, self.box if spread is None else self._box(width), count, seed)
         stability = held_stability(self.control, self.plant, self.period, at=self.cost.target)
-        boxes = [self._drawn(states, share * width, seed + 1) for share in _SHARES]
-        costs, all_fine = self._run(self.controller(), torch.cat((x0, *boxes)))  # at once: rows are alone
-        ours, fine = costs[:states], all_fine[:states]
-        base, also = self._run(Feedback(self.lqr), x0)
+        boxes = [self._drawn(count, share * width, seed + 1) for share in _SHARES if full]
+        loop = self.controller() if full or self.plan else Feedback(self)
+        steps = self.settles if states or count > _FEWEST or full else round(_SHORTER * self.settles)
+        costs, all_fine = self._run(loop, torch.cat((x0, *boxes)), steps)  # at once: rows are alone
+        ours, fine = costs[:count], all_fine[:count]
+        base, also = self._run(Feedback(self.lqr), x0, steps)
         both = fine & also
         over_base = (ours / base)[both]
         over_optimum = self._over_optimum(x0, ours, fine) if optimum else ours[:0]
         planner = self.plans()
+        strained = None if planner is None else float(planner.strained(x0).double().mean())
+        good = self._good(all_fine[count:].view(-1, count), count, width, seed + 1) if full else None
         return {
             "dt": self.period,
             "base": type(self.lqr).__name__,
@@ -186,15 +220,31 @@ class NearOptimal(SampledRollout):
             "spectral_radius": stability.spectral_radius,
             "largest_period": stability.largest_period,
             "spread": width,
+            "states": count,
             "regulated": float(fine.double().mean()),
             "over_base_median": _median(over_base),
             "over_base_max": float(over_base.max()) if len(over_base) else None,
             "over_optimum_median": _median(over_optimum),
             "over_optimum_max": float(over_optimum.max()) if len(over_optimum) else None,
-            "good_spread": self._good(all_fine[states:].view(-1, states), states, width, seed + 1),
-            "microseconds": self._microseconds(x0[:1]),
-            "strained": None if planner is None else float(planner.strained(x0).double().mean()),
+            "good_spread": good,
+            "microseconds": self._microseconds(x0[:1]) if full else None,
+            "strained": strained,
+            "left_out": self._left_out(full, optimum, bool(strained)),
         }
+
+    def _few(self) -> int:
+        """States whose loops take seconds: of a horizon of 60 periods and thousands of periods a few."""
+        memory = self.memory
+        of_row = memory.candidates * memory.lookahead / 2 if memory else self.steps * self.basis.count
+        return int(min(max(_WORK / (self.settles * of_row * self.substeps), _FEWEST), _STATES))
+
+    def _left_out(self, full: bool, optimum: bool, strained: bool) -> str:
+        """Say what a report has not, and how to get it."""
+        plans = "the plans of controller(), " if strained and not self.plan and self.memory is None else ""
+        parts = [] if full else [f"{plans}good_spread, microseconds: report(full=True)"]
+        if not optimum and self._has_optimum:
+            parts.append("over_optimum: report(optimum=True)")
+        return "; ".join(parts)
 
     def _box(self, width: float) -> Tensor:
         box = torch.full_like(self.box, width)
@@ -204,9 +254,9 @@ class NearOptimal(SampledRollout):
     def _drawn(self, states: int, width: float, seed: int) -> Tensor:
         return drawn(self.cost, self._box(width), states, seed)
 
-    def _run(self, controller: Controller, x0: Tensor) -> tuple[Tensor, Tensor]:
+    def _run(self, controller: Controller, x0: Tensor, steps: int) -> tuple[Tensor, Tensor]:
         """Cost until the slowest mode has decayed, and which rows were regulated."""
-        run = simulate(controller, self.plant, self.cost, x0, dt=self.period, steps=self.settles)
+        run = simulate(controller, self.plant, self.cost, x0, dt=self.period, steps=steps)
         return run.cost, arrived(self.cost, run.state[:, -1], x0) & ~run.diverged
 
     @property
@@ -221,15 +271,20 @@ class NearOptimal(SampledRollout):
         if not fine.all(dim=1).any():  # where 1 is far, as a gap of a centimetre in metres
             shares = tuple(2.0**-k for k in range(3, 13))
             x0 = torch.cat([self._drawn(states, share * width, seed) for share in shares])
-            fine = self._run(self.controller(), x0)[1].view(-1, states)
+            fine = self._run(self.controller(), x0, self.settles)[1].view(-1, states)
         good = [share for share, kept in zip(shares, fine.all(dim=1).tolist(), strict=True) if kept]
         return max(good, default=0.0) * width
 
     def _over_optimum(self, x0: Tensor, cost: Tensor, fine: Tensor) -> Tensor:
-        if self.plant.period is not None or not self.plant.traceable or self.cost.discount:
+        if not self._has_optimum:
             return cost[:0]
         best = DirectShooting(self.plant, self.cost).solve(x0)
         return (cost / best.value)[fine & torch.isfinite(best.value)]
+
+    @property
+    def _has_optimum(self) -> bool:
+        """Whether direct shooting takes the problem."""
+        return self.plant.period is None and self.plant.traceable and not self.cost.discount
 
     def _microseconds(self, x: Tensor) -> float:
         ready(self, x)
@@ -244,6 +299,7 @@ class NearOptimal(SampledRollout):
 
 @opaque
 @without_gradient("adp.near_optimal", "plant", "cost")
+@Sign("near_optimal")
 def near_optimal(
     plant: Plant,
     cost: Cost,

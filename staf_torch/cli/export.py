@@ -24,6 +24,7 @@ from ..results.build import processor
 from ..results.files import write_text
 from ..results.untrusted import visible
 from ..settings.chase import DTYPES
+from ..signs import Sign
 from .deployable import CarriesPlanError, Deployable, Learner, deployable, learning
 
 _PORTS = ("state", "control", "value", "gradient", "x", "u", "uniform")  # names of inputs and outputs
@@ -38,6 +39,7 @@ _ROUNDED = 0.05  # what float32 may lose, by its error against float64, in a fil
 _SAME = {"float64": 1e-9, "float32": 1e-3}  # farther from the library a file is broken, and not left behind
 
 
+@Sign("staf-export")
 def export(
     run: Path,
     to: str,

@@ -8,6 +8,8 @@ import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
+from ..signs import Sign
+
 MODULES = (
     *("staf_torch", "staf_torch.sweeps.python_api"),
     *("staf_torch.approximation.conditioning", "staf_torch.approximation.sensitivity"),
@@ -18,6 +20,7 @@ MODULES = (
 """What has a page; `staf_torch` brings the modules of its `__all__`: adp, optim, systems, targets, theory."""
 
 
+@Sign("writing reference pages", log=False)
 def main(words: Sequence[str]) -> str:
     """Write the pages into a folder, `site` where none is named; return where they begin.
 

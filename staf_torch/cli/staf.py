@@ -17,6 +17,7 @@ from omegaconf import OmegaConf
 from .. import __version__
 from ..results.build import source
 from ..settings import config_directory
+from ..signs import Sign
 from ..sweeps.hydra_compat import VERSION, find_launcher, full_errors, is_about_settings, program
 
 find_launcher()
@@ -48,7 +49,9 @@ def main() -> None:
             return
     except Exception:  # what a user got wrong, in the words of the command that runs something
         pass
-    importlib.import_module("staf_torch.cli.running").main()
+    with Sign("loading torch", log=False):
+        running = importlib.import_module("staf_torch.cli.running")
+    running.main()
 
 
 def _help() -> str:

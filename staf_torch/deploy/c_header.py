@@ -24,6 +24,7 @@ from ..lanes.trace.step import trace
 from ..lanes.trace.tracer import NotLoweredError
 from ..lanes.tree import Tree, flatten, labels
 from ..numerics.checks import fail
+from ..signs import Sign
 from .controllers import FilteredPolicy, SupervisedPolicy, check_bounded, in_dtype, searches
 from .counted import Source, counted
 from .formats import Run, as_tuple
@@ -32,6 +33,7 @@ from .remembered import RememberedPolicy
 from .sheet import Latency
 
 
+@Sign("export to C")
 def export_c(
     module: nn.Module,
     example: Tensor,
@@ -82,6 +84,7 @@ def export_c(
     return _write(path, program, (), {"state": example[:1]}, name, outputs, note)
 
 
+@Sign("export to C")
 def export_learning_c(
     controller: Controller, x0: Tensor, path: Path, *, dt: float, name: str | None = None, note: str = ""
 ) -> Source:
@@ -211,6 +214,7 @@ def runner_c(path: Path, sizes: Sequence[int | None], dtype: torch.dtype) -> Run
     return run
 
 
+@Sign("timing the C")
 def time_c(path: Path, states: Tensor, outputs: Sequence[int]) -> Latency:
     """Time every call of a header of `export_c`, compiled with -O2, inside C: median, 99 % and worst.
 

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torch.export import ExportedProgram
 
 from ..numerics.checks import fail, integer, trailing
+from ..signs import Sign
 from .counted import Source
 from .graph import trace
 from .names import check_count, check_dtype, function_name, listed_names
@@ -57,6 +58,7 @@ def need_compiler() -> None:
         )
 
 
+@Sign("export to ONNX")
 def export_onnx(
     program: ExportedProgram | nn.Module,
     path: Path,
@@ -154,6 +156,7 @@ def _unrolled(program: ExportedProgram, names: Sequence[str]) -> Any:
     return renamed(made.model_proto, dict(zip(own, names, strict=True)))
 
 
+@Sign("export to a torch program")
 def export_program(program: ExportedProgram, path: Path, note: Mapping[str, object]) -> None:
     """Write a program of `trace` with a note of what it is; `load_program` reads both.
 
@@ -208,6 +211,7 @@ def load_program(path: str | Path) -> tuple[ExportedProgram, dict[str, object]]:
     return program, said
 
 
+@Sign("export to a package of AOTInductor")
 def export_package(program: ExportedProgram, path: Path) -> None:
     """Compile a program of `trace` into an AOTInductor package, for one thread.
 

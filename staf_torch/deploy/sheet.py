@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.export import ExportedProgram
 
 from ..results.untrusted import visible
+from ..signs import Sign
 
 CALLS = 10_000
 _WARM = 500
@@ -108,6 +109,7 @@ def _count(value: Tensor) -> int:
     return math.prod(int(size) for size in value.shape if not isinstance(size, torch.SymInt))
 
 
+@Sign("timing the export")
 def latency(run: Callable[[Tensor], object], x: Tensor, calls: int = CALLS) -> Latency:
     """Time calls one by one with the input x (1, n), on one core where the system lets us choose."""
     taken = torch.empty(calls, dtype=torch.float64)

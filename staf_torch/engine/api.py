@@ -11,6 +11,7 @@ from ..approximation.basis import StaFBasis, Target
 from ..lanes import Program
 from ..lanes.opaque import opaque
 from ..optim.base import UpdateLaw
+from ..signs import Sign
 from . import row_program
 from .certificate import before_each, certify, first_link
 from .predictors import Predictor
@@ -23,6 +24,7 @@ _WORKING_BYTES = 2**26
 
 
 @opaque
+@Sign("chase")
 def chase(
     states: Tensor,
     basis: StaFBasis,
@@ -101,6 +103,7 @@ def chase_pieces(
 
 
 @opaque
+@Sign("chase_weights")
 def chase_weights(
     states: Tensor | Iterable[Tensor],
     basis: StaFBasis,

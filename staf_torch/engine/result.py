@@ -8,6 +8,7 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
+from ..numerics.shown import span
 from .certificate import Certificate
 
 
@@ -48,6 +49,14 @@ class ChaseResult:
         """(B,) bool: whether the trajectory, V, the Gram matrix or the weights became non-finite."""
         return self.diverged_at >= 0
 
+    def __repr__(self) -> str:
+        rows, times, count = self.weights.shape
+        return (
+            f"ChaseResult({rows} trajectories, {times} times, {count} centers; at the last time |V - V^| "
+            f"{span((self.value - self.estimate)[:, -1].abs())}, excess {span(self.excess[:, -1])}; "
+            f"{int(self.diverged.sum())} diverged)"
+        )
+
 
 @dataclasses.dataclass(frozen=True)
 class ChaseWeights:
@@ -70,6 +79,11 @@ class ChaseWeights:
     def diverged(self) -> Tensor:
         """(B,) bool: whether the trajectory, V, the Gram matrix or the weights became non-finite."""
         return self.diverged_at >= 0
+
+    def __repr__(self) -> str:
+        rows, times, count = self.weights.shape
+        lost = int(self.diverged.sum())
+        return f"ChaseWeights({rows} trajectories, {times} times, {count} centers; {lost} diverged)"
 
 
 def concatenate(pieces: Iterable[ChaseResult]) -> ChaseResult:

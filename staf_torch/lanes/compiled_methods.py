@@ -20,6 +20,7 @@ import torch
 from torch import Tensor, nn
 from torch.compiler import is_exporting
 
+from ..signs import Sign
 from .call import PlannedCall, ordinary
 from .contents import BOUND, Contents
 from .locks import Mutex
@@ -263,6 +264,7 @@ class CompiledMethod:
             return read
 
 
+@Sign("lanes.ready")
 def ready(module: nn.Module, x: Tensor) -> bool:
     """Compile now what serves calls like ``module(x)``: no control loop must wait for it later.
 

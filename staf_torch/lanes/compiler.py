@@ -18,6 +18,7 @@ import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
+from ..signs import Sign
 from .cache import cache, found, publish, scratch, used
 from .locks import Mutex
 
@@ -34,7 +35,6 @@ _ROUNDED_AS_WRITTEN = ("-ffp-contract=off", "-fno-math-errno", "-fno-trapping-ma
 _OF_PROGRAMS = ("-O2", *_SHARED, "-w", *_ROUNDED_AS_WRITTEN)
 # A long program takes GCC half the time without what looks at all of its loops and branches together.
 _LONG, _OF_LONG = 1500, ("-fira-region=one", "-fno-tree-pre", "-fno-gcse")  # lines
-_SLOW = 6000  # lines from which a user hears of it: some seconds
 _DIGEST = 32  # bytes at the end of a library in the cache
 _one_at_a_time = Mutex()  # threads of a chase ask for the same at the same time
 _said: set[str] = set()  # what has been logged
@@ -106,11 +106,10 @@ def _library(name: str, text: str, options: tuple[str, ...], folder: Path) -> Pa
     for path in found(file):
         if _is_whole(path):
             return path
-    if lines > _SLOW:
-        _log.warning("a program of %d lines is compiled, once: some %.0f s", lines, lines / 1600)
+    sign = Sign(f"compiling {lines} lines, once: some {1 + lines / 1600:.0f} s")
     # In a folder of its own first: another process may be building the same.
     path = cache() / file
-    with scratch(path.parent) as place:
+    with sign, scratch(path.parent) as place:
         source, built = place / f"{name}.cpp", place / path.name
         source.write_text(text, encoding="utf-8")
         run([*command, str(source), "-o", str(built)], short=lines < _SLOW)

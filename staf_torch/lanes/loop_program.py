@@ -1,4 +1,4 @@
-"""Loops that begin in plain torch: compiled where that repays; a line of the log where they take long."""
+"""Loops that begin in plain torch: compiled where that repays; a sign, and advice, where they take long."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from ..signs import Sign
 from .compiled_methods import methods_of
 from .plain_time import PlainTime, RepaysError
 from .program import Program
@@ -46,6 +47,7 @@ class LoopProgram:
         self._step, self._make, self._times, self._remedy = plain.step, compiled, times, remedy
         self._plain = Program(self._timed, name=plain.name, compile=False)
         self._compiled: Program | None = None
+        self._sign = Sign(f"{plain.name} in plain torch", times)
         self._done, self._spent, self._fastest, self._said = 0, 0.0, math.inf, False
         self._parts, self._waited = parts, False
 
@@ -56,7 +58,8 @@ class LoopProgram:
         if self._compiled is None:
             put_back = generators() if not self._done else None
             try:
-                return self._plain(carry, now, row, steps=steps, every=every)
+                with self._sign:
+                    return self._plain(carry, now, row, steps=steps, every=every)
             except RepaysError:
                 assert self._make is not None
                 assert put_back is not None
@@ -78,6 +81,7 @@ class LoopProgram:
     def _look(self, seconds: float) -> None:
         """Log once, if a loop takes long, how long the rest of it takes by the fastest step so far."""
         self._done, self._spent = self._done + 1, self._spent + seconds
+        self._sign.advance()
         self._fastest = min(self._fastest, seconds)
         if self._said or self._done < 2 or self._spent < _SAID:
             return

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from ..signs import Sign
 from . import cache
 from .cache import Trace
 from .call import Compiled, Given, PlannedCall, form, ordinary
@@ -305,7 +306,7 @@ class Program(Derived):
         if self._read is None and self._watched:
             self._read = Contents(self.step)
         try:
-            with undrawn():
+            with undrawn(), Sign(f"compiling {self.name}"):
                 made = self._known(given, copies)
             if (lines := made.text.source.count("\n")) > _LONGEST:
                 raise NotLoweredError(f"the program is {lines} lines long, which take a compiler minutes")

@@ -19,6 +19,7 @@ from ..kernels import NAMED, Kernel
 from ..lanes.locks import ReadWriteLock
 from ..lanes.opaque import opaque
 from ..numerics.checks import choice, fail, integer
+from ..signs import Sign
 from .compiled_filter import DirectCalls
 from .samples import in_place, lapse_of, lapses, like_given, pair, tensor_of
 
@@ -208,8 +209,10 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         """
         states, values = pair(self._call("fit"), x, y, (2, 3))
         lapse, twin = lapses(self._call("fit"), time, states), self._twin()
-        for k, (state, value) in enumerate(zip(states, values, strict=True)):
-            twin._learn(state, value, None if lapse is None else lapse[k])
+        with Sign(self._call("fit"), len(states), "samples") as sign:
+            for k, (state, value) in enumerate(zip(states, values, strict=True)):
+                twin._learn(state, value, None if lapse is None else lapse[k])
+                sign.advance()
         self._change(self._take_over, twin)
         return self
 

@@ -15,6 +15,7 @@ from ..centers import ball, rings
 from ..centers.layouts import RING_COUNTS
 from ..kernels import NAMED, Kernel
 from ..numerics.checks import choice, fail, flag, integer, positive_real, real
+from ..signs import Sign
 from .estimator import StreamEstimator, Streams
 from .filter_streams import FilterStreams
 from .kalman_filter import LocalFilter, StreamState
@@ -120,6 +121,7 @@ class StaFRegressor(StreamEstimator):
         """Return the hyperparameters that `tune` found, None before."""
         return self._tuning
 
+    @Sign("StaFRegressor.tune")
     def tune(self, x: Any, y: Any) -> Self:
         """Learn the hyperparameters from a stretch, stream by stream, and hold them from now on.
 
@@ -145,6 +147,7 @@ class StaFRegressor(StreamEstimator):
         self._reset()
         self._tuning = found
 
+    @Sign("StaFRegressor.smooth")
     def smooth(self, x: Any, y: Any, time: Any = None) -> tuple[Any, Any]:
         """Estimate V at recorded states from the samples before and after each: the filter and back again.
 

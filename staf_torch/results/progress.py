@@ -1,26 +1,21 @@
-"""Progress of long loops: a bar on a terminal, now and then a line in the log otherwise."""
+"""Progress of an experiment's loops: signs of life, or for a listener that shows several together."""
 
 from __future__ import annotations
 
 import contextlib
-import logging
-import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import TypeVar
 
-from tqdm.auto import tqdm
+from ..signs import Sign
 
 T = TypeVar("T")
-_log = logging.getLogger(__name__)
-_QUIET = 2.0  # seconds before anything is shown: short loops need none
-_LINE_EVERY = 10.0  # s
 
 
 class Progress:
     """Report how far long loops of an experiment are.
 
     Args:
-        listener: is told the share of the loop that is done, and nothing is shown; None: a bar or log lines.
+        listener: is told the share of the loop that is done, and nothing is shown; None: `signs`.
 
     Example:
         >>> for radius in Progress().each([0.1, 0.2], "radii"):
@@ -45,35 +40,19 @@ class Progress:
             total: number of steps.
             what: what is counted, for the message.
         """
-        tell = self._listener or _log_lines(total, what)
-        done = 0
-        hidden = None if self._listener is None else True  # None: shown where stderr is a terminal
-        with tqdm(total=total, unit=f" {what}", delay=_QUIET, leave=False, disable=hidden) as bar:
+        if self._listener is None:
+            with Sign("", total, what) as sign:
+                yield sign.advance
+            return
+        tell, done = self._listener, 0
 
-            def advance(steps: int) -> None:
-                nonlocal done
-                done += steps
-                bar.update(steps)
-                if bar.disable:
-                    tell(done / total)
+        def advance(steps: int) -> None:
+            nonlocal done
+            done += steps
+            tell(done / total)
 
-            yield advance
+        yield advance
 
 
 SHOWN = Progress()
-"""Bars and log lines: what a program that asks for nothing else gets."""
-
-
-def _log_lines(total: int, what: str) -> Callable[[float], None]:
-    """Return a function that logs the share that is done, a line every ten seconds, the first after two."""
-    start = time.monotonic()
-    said = start + _QUIET - _LINE_EVERY
-
-    def tell(share: float) -> None:
-        nonlocal said
-        now = time.monotonic()
-        if now - said >= _LINE_EVERY:
-            said, left = now, (now - start) * (1 - share) / share
-            _log.info("%.0f %% of %d %s, %.0f s left", 100 * share, total, what, left)
-
-    return tell
+"""Signs of life: what a program that asks for nothing else gets."""

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from ..numerics import fail
+from ..signs import Sign
 from .build import damage, damaged, short
 from .files import (
     COMPLETED,
@@ -49,6 +50,7 @@ _UNSAID = {RUNNING: "has not ended: it goes on, or was killed", FAILED: "no reas
 """Statuses, and what is said of one without a reason."""
 
 
+@Sign("reading runs", log=False)
 def collect(path: str | Path | Sequence[str | Path]) -> Collection:
     """Read every run directory at or under a path: also those of a sweep that goes on, or was killed.
 

@@ -24,6 +24,7 @@ from ..results import run_record as records
 from ..results.files import METRICS
 from ..results.progress import SHOWN, Progress
 from ..settings.chase import make_metrics, units_of
+from ..signs import Sign
 from . import lock
 from .batching import DEFERRED, USER_ERRORS, Outcome, completion, reason, sentence
 from .hydra_compat import as_typed
@@ -71,7 +72,8 @@ def execute(
         else:
             if node.mode == RunMode.RUN and records.completed(directory) is not None:
                 _log.info("replaces the run of the same command line in %s", os.path.relpath(directory))
-            with recorded(record, directory, seconds):
+            name = choices.get("experiment") or cfg.task
+            with Sign(f"experiment {name}"), recorded(record, directory, seconds):
                 record.declare([metric.info for metric in make_metrics(cfg.get("metric"))])
                 record.measured_in(units_of(cfg))
                 metrics = completion(cfg, outcome)(cfg, directory, progress)

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig
-from tqdm.auto import tqdm
 
 from ..lanes.compiler import compiler
 from ..numerics.checks import choice, integer
@@ -22,6 +21,7 @@ from ..results import run_record as records
 from ..results.files import METRICS, ROWS, RUN, partial_name
 from ..results.progress import Progress
 from ..settings.plain import ManySettings
+from ..signs import Sign, write
 from . import lock, table, workers
 from .batching import Flat, Outcome, reason
 from .clusters import executor
@@ -38,7 +38,6 @@ _NOT_BATCHED = (
 )
 _TOLD = 20  # failures of different reasons that are told as they happen
 _ALIKE = 8  # jobs that fail alike, whatever is swept, end a sweep
-_BAR_EVERY, _LINE_EVERY = 0.2, 10.0  # s
 
 
 @contextlib.contextmanager
@@ -68,10 +67,10 @@ class SweepProgress:
         self._total, self._before, self._done, self._failed = total, done, done, 0
         self._reasons: dict[str, tuple[str, int]] = {}  # the first job that failed so, and how many more did
         self._computed, self._running = 0.0, 0.0
-        self._start = self._shown = time.monotonic()
+        self._start = time.monotonic()
         # Not the log: while a job is replayed, that is the job's own.
-        layout = "{percentage:3.0f}%|{bar:30}| {desc}"
-        self._bar = tqdm(total=total, bar_format=layout, leave=False, disable=None)
+        self._sign = Sign(lambda: self.line, total, log=False)
+        self._sign.__enter__()
 
     def computed(self, jobs: float) -> None:
         """Note how many of the jobs that were left are computed, with or without their files."""
@@ -92,12 +91,12 @@ class SweepProgress:
             if more >= 0 or len(self._reasons) < _TOLD:
                 self._reasons[failure] = first, more + 1
             if more < 0 and failure in self._reasons:
-                tqdm.write(f"{name} failed: {failure}", file=sys.stderr)
+                write(f"{name} failed: {failure}")
         self._show()
 
     def close(self) -> None:
         """Wipe the bar, and say how many jobs failed like one that was told."""
-        self._bar.close()
+        self._sign.__exit__()
         for first, more in self._reasons.values():
             if more:
                 sys.stderr.write(f"{more} more failed like {first}\n")
@@ -118,16 +117,7 @@ class SweepProgress:
         return min(1.0, computed / max(1, self._total - self._before))
 
     def _show(self) -> None:
-        now = time.monotonic()
-        if now - self._shown < (_LINE_EVERY if self._bar.disable else _BAR_EVERY):
-            return
-        self._shown = now
-        if self._bar.disable:
-            sys.stderr.write(self.line + "\n")
-            sys.stderr.flush()
-            return
-        self._bar.n = self._share * self._total
-        self._bar.set_description_str(self.line)
+        self._sign.done = self._share * self._total
 
 
 def job_name(num: int, overrides: Sequence[str]) -> str:

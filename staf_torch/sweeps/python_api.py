@@ -27,6 +27,7 @@ from ..results.files import FAILED, FIGURES, HISTORY, RUN, parse_overrides
 from ..results.reader import Collection, Value, collect, identity, read_record
 from ..results.run_directory import History
 from ..results.untrusted import UnreadableError, read_bytes
+from ..signs import Sign
 from ..tables import Layout, Style, Table, html_text, tabulate
 from ..tables.aggregate import lost_share
 from ..tables.columns import significant
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
 Draw = Callable[["Run"], Mapping[str, "Figure"]]
 
 
+@Sign("staf_torch.run", log=False)
 def run(*overrides: str, directory: str | Path | None = None) -> Run:
     """Run one experiment, as `staf` does with the same overrides.
 
@@ -83,6 +85,7 @@ def run(*overrides: str, directory: str | Path | None = None) -> Run:
     return Run.of(read_record(path), functools.partial(_kept, figures))
 
 
+@Sign("staf_torch.sweep", log=False)
 def sweep(*overrides: str, directory: str | Path | None = None) -> Runs:
     """Run a sweep, as `staf -m` does with the same overrides: in tensor batches, a directory for each job.
 

@@ -183,9 +183,6 @@ class Barrier(ControlAffineSystem):
         rows = scale.unsqueeze(-1)
         return Linearisation(rows * found.matrix / scale, rows * found.input_matrix)
 
-    def extra_repr(self) -> str:
-        return f"low={self.low.tolist()}, high={self.high.tolist()}"
-
     def _shares(self, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """x - c, (x - low)/(c - low) and (high - x)/(high - c), the last two 1 where there is no wall."""
         below, above = self.below.to(s), self.above.to(s)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from ..numerics.angles import wrap
+from ..numerics.shown import limits, settings, sizes
 from .bounds import Bounds
 
 
@@ -140,6 +141,13 @@ class Plant(nn.Module, abc.ABC):
             (...), or None where it is not known.
         """
         return None
+
+    def extra_repr(self) -> str:
+        """`2 states, 1 input, mass=1`: sizes, what else is declared, and numbers that were given."""
+        parts = [sizes(self.dim, self.inputs), *settings(self, "dim", "inputs", "dt")]
+        parts += [f"period={self.period:g} s"] if self.period else []
+        parts += [f"periodic={list(self.periodic)}"] if self.periodic else []
+        return ", ".join([*parts, *limits(self.bounds)])
 
     def _size(self) -> int:
         if self.dim is None:

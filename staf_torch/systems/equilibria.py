@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ..lanes.gradients import refuse_gradient
 from ..numerics.differences import central_slopes
+from ..signs import Sign
 from .base import Plant
 
 _REST = 1e-6  # of the fastest rate of the linearisation, below which a plant counts as resting
@@ -84,6 +85,7 @@ class Equilibrium(NamedTuple):
     input: Tensor  # (m,)
 
 
+@Sign("find_equilibrium")
 def find_equilibrium(
     plant: Plant, x: Sequence[float] | Tensor, u: Sequence[float] | Tensor | None = None
 ) -> Equilibrium:

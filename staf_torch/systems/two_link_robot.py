@@ -76,6 +76,3 @@ class TwoLinkRobot(ControlAffineSystem):
         det = one * other - cross * cross
         rows = torch.stack((other, -cross), dim=-1), torch.stack((-cross, one), dim=-1)
         return torch.stack(rows, dim=-2) / det[..., None, None]
-
-    def extra_repr(self) -> str:
-        return f"inertia={self.inertia.tolist()}, friction={self.friction.tolist()}"

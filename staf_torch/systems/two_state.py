@@ -53,9 +53,6 @@ class TwoState(ControlAffineSystem):
             return None
         return scale.to(x) * (0.5 * x[..., 0].square() + x[..., 1].square())
 
-    def extra_repr(self) -> str:
-        return f"as_printed={self.as_printed}"
-
 
 def input_gain(x1: Tensor) -> Tensor:
     """h = cos 2 x1 + 2, the second entry of g, also of the plant's two successors."""

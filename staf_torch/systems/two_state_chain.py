@@ -48,6 +48,3 @@ class TwoStateChain(ControlAffineSystem):
     def effectiveness(self, x: Tensor) -> Tensor:
         gain = input_gain(x[..., 0])
         return torch.stack((torch.zeros_like(gain), gain), dim=-1).unsqueeze(-1)
-
-    def extra_repr(self) -> str:
-        return f"theta={self.theta.tolist()}"

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ..centers.layouts import monomials
 from ..numerics.checks import fail, integer, positive_real, sampled, trailing
+from ..signs import Sign
 from .uniform_approximation import ball_grid, near_best, supremum
 
 _BETWEEN = 1.01  # for what the search for a supremum may have missed
@@ -230,6 +231,7 @@ class ExponentialBound:
         return self.one_polynomial.count
 
 
+@Sign("exponential_bound")
 def exponential_bound(
     target: Callable[[Tensor], Tensor],
     domain: Tensor,
@@ -287,6 +289,7 @@ def exponential_bound(
         return ExponentialBound(N, S, problem.construct((p, q), (N, S)), problem.one_polynomial())
 
 
+@Sign("one_polynomial_bound")
 def one_polynomial_bound(
     target: Callable[[Tensor], Tensor],
     domain: Tensor,

@@ -17,6 +17,7 @@ from ..centers import StateFollowingCenters, ball, polygon, rings
 from ..kernels import Kernel
 from ..local_basis import GradedBasis, GradedSpace, LocalSpace, newton_space, phi
 from ..numerics.checks import fail, positive_real, trailing
+from ..signs import Sign
 from .uniform_approximation import ball_grid, supremum
 
 _BLOCK = 2**21  # kernel values in a temporary
@@ -62,6 +63,7 @@ def standard_layouts(dim: int) -> list[Tensor]:
     return [ball(count, dim) for count in counts if count <= _MOST_CENTERS]
 
 
+@Sign("minimal_count")
 def minimal_count(
     target: Callable[[Tensor], Tensor],
     kernel: Kernel,
@@ -119,6 +121,7 @@ def minimal_count(
     return MinimalCount(int(counts[enough.int().argmax()]), pointwise, counts, errors)
 
 
+@Sign("layout_errors")
 def layout_errors(
     target: Callable[[Tensor], Tensor],
     kernel: Kernel,

@@ -15,6 +15,7 @@ from ..engine import along, gram_rates
 from ..numerics.checks import fail, integer, positive_real, trailing
 from ..numerics.linalg import condition_number
 from ..optim import SteepestDescent, UpdateLaw
+from ..signs import Sign
 
 _STARTS, _ASCENTS = 8, 60
 
@@ -52,6 +53,7 @@ class UltimateBound(NamedTuple):
     after: float  # as corrected at x_k
 
 
+@Sign("drift_constants")
 def drift_constants(basis: StaFBasis, target: Target, states: Tensor, velocities: Tensor) -> DriftConstants:
     """The constants of `ultimate_bound` over given states.
 
@@ -105,6 +107,7 @@ def drift_constants(basis: StaFBasis, target: Target, states: Tensor, velocities
     )
 
 
+@Sign("ultimate_bound")
 def ultimate_bound(
     constants: DriftConstants, law: UpdateLaw, *, dt: float, inner_steps: int
 ) -> UltimateBound:
@@ -180,6 +183,7 @@ def step_for_bound(
     return math.log1p(room / (way / growth + q * radius)) / growth
 
 
+@Sign("steps_for_bound")
 def steps_for_bound(
     constants: DriftConstants, law: UpdateLaw, *, excess: float, dt: float, before: bool = False
 ) -> int | None:

@@ -12,6 +12,7 @@ from torch import Tensor
 from ..centers import probe_points
 from ..centers.layouts import monomials
 from ..numerics.checks import integer, positive_real, vector
+from ..signs import Sign
 
 _STARTS = 8  # points of the grid from which a supremum is sought
 _CLIMBS = 16
@@ -132,6 +133,7 @@ class NearBest(NamedTuple):
     lower: Tensor  # (D,) no polynomial of this degree has a smaller one there
 
 
+@Sign("near_best")
 def near_best(points: Tensor, degree: int, values: Tensor, weight: Tensor, tolerance: Tensor) -> NearBest:
     """Minimise max_j weight_j |f(z_j) - p(z_j)| over the polynomials p of the degree, row by row.
 

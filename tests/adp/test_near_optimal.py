@@ -97,7 +97,7 @@ def test_where_a_bound_holds_the_base_at_the_end_its_own_control_is_kept() -> No
 @torch.no_grad()
 def test_report_says_what_was_chosen_and_how_good_it_is(two_states: NearOptimal) -> None:
     policy = two_states
-    report = policy.report(states=3, spread=0.5)
+    report = policy.report(states=3, spread=0.5, full=True, optimum=True)
     assert report["dt"] == 0.1
     assert report["centers"] == 3
     assert report["spectral_radius"] < 1 < report["largest_period"] / 0.1
@@ -107,6 +107,15 @@ def test_report_says_what_was_chosen_and_how_good_it_is(two_states: NearOptimal)
     assert report["good_spread"] in (0.5, 1.0, 2.0)  # times 1, 2 and 4 of half a unit
     assert report["microseconds"] > 0
     assert report["strained"] is None
+    assert report["left_out"] == ""
+    short = policy.report(states=3, spread=0.5)
+    assert short["left_out"] == (
+        "good_spread, microseconds: report(full=True); over_optimum: report(optimum=True)"
+    )
+    assert {name for name, value in short.items() if value is None} - {"strained"} == {
+        *("good_spread", "microseconds", "over_optimum_median", "over_optimum_max")
+    }
+    assert short["over_base_max"] == pytest.approx(report["over_base_max"], rel=1e-9)
 
 
 @pytest.mark.needs_compiler
@@ -221,10 +230,10 @@ def test_report_finds_the_region_of_a_plant_in_small_units() -> None:
     policy = adp.near_optimal(
         Gap(), adp.QuadraticCost(25.0, 1.0, dim=1, inputs=1), dt=0.05, horizon=0.2, reach="local"
     )
-    report = policy.report(states=2, optimum=False)
+    report = policy.report(states=2, full=True)
     assert report["regulated"] == 0  # in the box of 1
     assert 1 / 256 <= report["good_spread"] <= 1 / 32
-    near = policy.report(states=2, spread=0.01, optimum=False)
+    near = policy.report(states=2, spread=0.01, full=True)
     assert 1 / 512 <= near["good_spread"] <= 1 / 25  # the same region, asked for by another box
 
 

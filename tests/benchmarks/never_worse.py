@@ -36,7 +36,7 @@ def main(states: int) -> int:
         cost = adp.QuadraticCost(q, r, plant.dim, plant.inputs)
         limits = {} if bound is None else {"low": -bound, "high": bound}
         told = adp.near_optimal(plant, cost, dt=dt, **limits).report(
-            states=states, spread=width, optimum=False, seed=12345
+            states=states, spread=width, full=True, seed=12345
         )
         print(
             name, {key: told[key] for key in ("over_base_median", "over_base_max", "regulated")}, flush=True

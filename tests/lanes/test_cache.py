@@ -310,18 +310,16 @@ def test_a_file_that_cannot_be_compiled_is_none_and_said_once(
 
 
 @pytest.mark.parametrize("name", ["g++", "clang++"])
-def test_a_long_program_is_built_by_every_compiler_and_a_slow_one_is_told(
-    name: str, cache: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+def test_a_long_program_is_built_by_every_compiler(
+    name: str, cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Options that spare one compiler half of its time are errors to another."""
     if shutil.which(name) is None:
         pytest.skip(f"there is no {name} here")
     monkeypatch.setenv("CXX", name)
     text = lanes.Program(lambda x, *_: (x + 1, x)).text(torch.zeros(1), steps=1)
-    for lines, told in ((2000, False), (7000, True)):
-        compiler.machine_code(text + f"// {name}\n" * lines)
-        assert ("is compiled, once: some 4 s" in caplog.text) is told
-    assert len(list(cache.glob("lanes-*.so"))) == 2
+    compiler.machine_code(text + f"// {name}\n" * 2000)
+    assert len(list(cache.glob("lanes-*.so"))) == 1
 
 
 def test_the_cache_forgets_what_nobody_has_used_and_nothing_of_today(tmp_path: Path) -> None:

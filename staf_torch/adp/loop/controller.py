@@ -14,6 +14,7 @@ from ...lanes.contents import is_users, version
 from ...lanes.gradients import gradients_of, marked
 from ...numerics.checks import copied, real
 from ...numerics.linalg import riccati
+from ...numerics.shown import limits, shown
 from ...systems import Plant
 from ..problem.cost import Cost, matvec, quadratic
 from ..problem.held_linear import held_riccati
@@ -241,6 +242,11 @@ class LQR(nn.Module):
         """u: (..., n) -> (..., m)."""
         u = self.cost.saturate(self.cost.input_of(-matvec(self.k, self.cost.deviation(x))))
         return marked("LQR", self.layers, u) if self.layers else u
+
+    def __repr__(self) -> str:
+        about = [f"K={shown(self.k)}", *([f"period={self.period:g} s"] if self.period else [])]
+        about += [] if self.cost.target is None else [f"target={shown(self.cost.target)}"]
+        return f"LQR({', '.join([*about, *limits(self.cost.bounds)])})"
 
     def value(self, x: Tensor) -> Tensor:
         """e'Pe: (..., n) -> (...)."""

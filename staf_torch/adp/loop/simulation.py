@@ -23,6 +23,7 @@ from ...numerics.angles import wrap
 from ...numerics.checks import choice, copied, fail, integer, positive_real, trailing
 from ...numerics.exponential_step import BENT
 from ...results import pictures
+from ...signs import Sign
 from ...systems import ControlAffineSystem, Plant
 from ..problem.cost import Cost
 from ..problem.held_plant import RESOLVED, Holding, Substeps, fewest_and_most
@@ -202,7 +203,7 @@ def simulate(
             enough to pay for it by the operations of its first step, so that the choice is always the same;
             never with a controller that improves plans: some seconds, once). What cannot be compiled runs in
             plain torch, which is the definition, with one line in the log, and a loop in plain torch that
-            takes more than some seconds says how many. Both agree to some 1e-12; True or False fix the bits.
+            takes more than some seconds says how far it is. Both agree to 1e-12; True or False fix the bits.
         progress: called with the number of steps done since its last call.
 
     Raises:
@@ -299,7 +300,10 @@ class _LoopRun:
         compiled = (worth(pays) if self.compile == "auto" else bool(self.compile)) and loop.system.traceable
         found = program(loop, compiled)
         ran = _beginning(loop, found, self.steps) if not compiled and undecided(self.compile) else found
-        return _run(loop, ran, self.x0, self.steps, self.every, self.seeds, self.progress)
+        counted = self.progress is None and ran is found  # a `LoopProgram` counts its steps itself
+        with Sign("adp.simulate", self.steps if counted else 0) as sign:
+            tell = self.progress or sign.advance
+            return _run(loop, ran, self.x0, self.steps, self.every, self.seeds, tell)
 
     def checked(self, loop: ClosedLoop, result: LoopResult, rows: Tensor, again: bool) -> LoopResult:
         """Return the result in which the rows of a mask (B,) that need more steps took them, if they may run
@@ -347,7 +351,7 @@ def _run(
     steps: int,
     every: int,
     seeds: Sequence[int],
-    progress: Callable[[int], None] | None,
+    progress: Callable[[int], None],
 ) -> tuple[LoopResult, LoopState]:
     state = loop.init(x0)
     pieces: list[list[Tensor]] = []
@@ -363,8 +367,7 @@ def _run(
         if done % every == 0:
             pieces.append(flatten(out)[0])
         done += count
-        if progress is not None:
-            progress(count)
+        progress(count)
     last, structure = flatten(record(loop, state, torch.full_like(pieces[-1][1][:, -1], torch.nan)))
     pieces.append([part.unsqueeze(1) for part in last])
     kept = unflatten(structure, (torch.cat(column, dim=1) for column in zip(*pieces, strict=True)))

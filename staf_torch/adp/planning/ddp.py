@@ -23,6 +23,7 @@ from ...lanes.tree import Tree
 from ...numerics.box import minimum_and_slopes
 from ...numerics.checks import fail, integer, positive_real, trailing
 from ...numerics.riccati import riccati_step
+from ...signs import Sign
 from ..problem.sampled import Derivatives, SampledProblem
 from .trajectories import (
     CostedTrajectories,
@@ -99,8 +100,13 @@ class BoxDDP:
         self._back = Program(self.backward, name="a backward pass", compile=compile)
         self._forth = Program(self.forward, name="a forward pass", compile=compile)
 
+    def __repr__(self) -> str:
+        about = f"steps={self.steps}, iterations={self.iterations}, tolerance={self.tolerance:g}"
+        return f"BoxDDP({self.problem!r}, {about})"
+
     @opaque
     @without_gradient("BoxDDP.solve", "x0", "control", "reference", "terminal", "self")
+    @Sign("BoxDDP")
     def solve(
         self,
         x0: Tensor,

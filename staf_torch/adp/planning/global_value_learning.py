@@ -12,6 +12,7 @@ from torch import Tensor
 from ...lanes.gradients import without_gradient
 from ...lanes.opaque import opaque
 from ...numerics.checks import fail, integer, real
+from ...signs import Sign
 from ..problem.sampled import SampledProblem
 from .ddp import BoxDDP
 from .global_value import GlobalValue, check_memorable
@@ -34,6 +35,7 @@ class Guesses(NamedTuple):
 
 @opaque
 @without_gradient("learn_global_value", "problem")
+@Sign("learn_global_value")
 def learn_global_value(
     problem: SampledProblem,
     region: Sequence[float] | Tensor,
@@ -102,18 +104,20 @@ def learn_global_value(
         return problem.goal + width * (2 * uniform - 1)
 
     library = swept(memory(_first(search, drawn(trajectories), generator)), search)
-    for round_ in range(rounds):
-        known = memory(library)
-        x = drawn(states)
-        before = known.choose(x).value
-        found = best_from(known, search, x)
-        better = before - found.cost > _WORTH * found.cost
-        share = float((~better).double().mean())
-        _log.info("round %d: %.1f %% of %d fresh states known to 1 %%", round_ + 1, 100 * share, states)
-        both = (torch.cat((old, new[better])) for old, new in zip(library, found, strict=True))
-        library = swept(memory(Trajectories(*both)), search)
-        if share >= enough:
-            break
+    with Sign("", rounds, "rounds") as sign:
+        for round_ in range(rounds):
+            known = memory(library)
+            x = drawn(states)
+            before = known.choose(x).value
+            found = best_from(known, search, x)
+            better = before - found.cost > _WORTH * found.cost
+            share = float((~better).double().mean())
+            _log.info("round %d: %.1f %% of %d fresh states known to 1 %%", round_ + 1, 100 * share, states)
+            both = (torch.cat((old, new[better])) for old, new in zip(library, found, strict=True))
+            library = swept(memory(Trajectories(*both)), search)
+            sign.advance()
+            if share >= enough:
+                break
     known = memory(library)
     late = int((~known.arrives).sum())
     if late:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ...numerics.checks import choice, fail, integer, positive_real
+from ...signs import Sign
 from ...systems import Plant
 from ..problem.cost import Matrix, QuadraticCost
 from ..problem.sampled import SampledProblem
@@ -118,6 +119,7 @@ class AvoidancePlans(NamedTuple):
         return AvoidancePlans(trajectories, *chosen(kept, self[1:], other[1:]))
 
 
+@Sign("plan_around")
 def plan_around(
     plant: Plant,
     cost: AvoidanceCost,

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ...numerics.rows import chosen as chosen
+from ...numerics.shown import span
 from ..problem.sampled import SampledProblem
 
 _LENGTHS = (2, 4, 7, 12, 20, 30)  # periods for which a corner of the bounds is held before the feedback
@@ -31,6 +32,11 @@ class Trajectories(NamedTuple):
     def cost(self) -> Tensor:
         """(B,)."""
         return self.value[:, 0]
+
+    def __repr__(self) -> str:
+        rows, steps = self.control.shape[:2]
+        found = f"{int(self.converged.sum())} converged" if self.converged.numel() == rows else ""
+        return f"Trajectories({rows} of {steps} steps, cost {span(self.cost)}, {found})"
 
 
 class Reference(NamedTuple):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable, Sequence
-from typing import Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -23,6 +23,7 @@ from ...numerics.checks import (
     vector,
 )
 from ...numerics.linalg import positive_definite, positive_semidefinite
+from ...numerics.shown import limits, shown, sizes
 from ...systems import Bounds, Plant
 from ...systems.bounds import Limit
 from ...systems.equilibria import resting_input_at
@@ -157,6 +158,17 @@ class Cost(nn.Module, abc.ABC):
         other.bounds = Bounds(low, high, self.inputs)
         other._prepare()
         return other
+
+    def extra_repr(self) -> str:
+        given: dict[str, Any] = {
+            "target": self.target,
+            "target_input": self.target_input,
+            "output": self.output,
+        }
+        given |= {"output": self.output, "discount": self.discount or None, "terminal": self.ending}
+        parts = [f"{name}={shown(value)}" for name, value in given.items() if value is not None]
+        rates = f"state={shown(self.q)}, control={shown(self.r)}"
+        return ", ".join([sizes(self.dim, self.inputs), rates, *limits(self.bounds), *parts])
 
     def set_point(self) -> Tensor | None:
         """The state that the LQR is a feedback around, (n,); None for the origin."""

@@ -16,6 +16,7 @@ from ...numerics.checks import fail, positive_real
 from ...numerics.differences import STEP, central_slopes
 from ...numerics.exponential_step import quadratic_integral
 from ...numerics.linalg import check_modes, discrete_riccati, exponential, unstabilisable_mode
+from ...signs import Sign
 from ...systems import Clocked, Plant
 from .cost import Cost
 
@@ -149,6 +150,7 @@ class HeldStability(NamedTuple):
 
 
 @without_gradient("held_stability", "policy", "system", "at")
+@Sign("held_stability")
 def held_stability(
     policy: Callable[[Tensor], Tensor], system: Plant, period: float, *, at: Tensor | None = None
 ) -> HeldStability:

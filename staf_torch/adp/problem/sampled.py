@@ -19,6 +19,7 @@ from ...numerics.checks import fail, integer, trailing
 from ...numerics.forward_mode import use_forward_mode
 from ...numerics.linalg import discrete_riccati, positive_semidefinite, unstabilisable_mode
 from ...numerics.runge_kutta import runge_kutta_mean, runge_kutta_stages
+from ...numerics.shown import limits, sizes
 from ...systems import Bounds, Plant
 from ...systems.bounds import Limit
 from .cost import Cost, EndValue, Matrix, square
@@ -128,6 +129,13 @@ class SampledProblem(nn.Module):
                 "Give `terminal`, V_T of x or S of d'Sd, or a horizon after which nothing counts.",
                 self.unregulated,
             )
+
+    def extra_repr(self) -> str:
+        """Return sizes and bounds, and where plans begin if not from a linear feedback."""
+        why = ["no linear feedback at the goal"] if self.unregulated else []
+        return ", ".join(
+            [sizes(self.dim, self.inputs), *limits(self.bounds if self.bounds.present else None), *why]
+        )
 
     @classmethod
     @without_gradient("SampledProblem.of", "plant", "cost", "terminal")

@@ -13,6 +13,7 @@ from torch import Tensor
 from ...lanes import compiled, repeat, where_rows
 from ...lanes.gradients import gradients_of, marked
 from ...numerics.checks import fail, one_or_each, positive, positive_real, trailing
+from ...numerics.shown import limits, shown
 from ...systems import Bounds, Plant
 from ...systems.bounds import Limit
 from ..loop.controller import Carried, Controller, Feedback, Policy
@@ -191,6 +192,13 @@ class SafetyFilter(Controller):
     def _policy(self) -> Policy | None:
         """The policy, where it remembers nothing."""
         return self.controller.policy if isinstance(self.controller, Feedback) else None
+
+    def __repr__(self) -> str:
+        count = len(self.constraints)
+        about = [f"around {self.controller.label}", repr(self.plant), f"held for {self.hold:g} s"]
+        about += [f"{count} constraint{'s' if count != 1 else ''}", f"decay={shown(self.decay)} 1/s"]
+        about += limits(self.bounds if self.bounds.present else None)
+        return f"SafetyFilter({', '.join(about)})"
 
     @property
     def label(self) -> str:

@@ -87,7 +87,7 @@ def test_a_plan_leads_around_and_is_compiled_as_it_is_defined(caplog: pytest.Log
     defined = adp.simulate(guard, point, cost, x0, steps=2, compile=False)
     compiled = adp.simulate(guard, point, cost, x0, steps=24, compile=True)
     torch.testing.assert_close(compiled.state[:, :3], defined.state, rtol=1e-9, atol=1e-9)
-    assert all("is compiled, once" in record.getMessage() for record in caplog.records)  # and not refused
+    assert not caplog.records  # and not refused
     assert guard.report(compiled)["constraint_violations"] == 0
     assert float(compiled.state[0, -1].norm()) < 0.1
 

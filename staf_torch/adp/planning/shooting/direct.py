@@ -13,6 +13,7 @@ from ....lanes.gradients import without_gradient
 from ....lanes.opaque import opaque
 from ....numerics.checks import fail, integer, positive_real, trailing
 from ....numerics.linalg import positive_semidefinite
+from ....signs import Sign
 from ....systems import ControlAffineSystem, Linear, Plant
 from ....systems.bounds import Limit
 from ...loop.controller import LQR, Policy, Value
@@ -211,8 +212,13 @@ class DirectShooting:
         end = positive_semidefinite("DirectShooting", "terminal", end, cost.dim)
         return lambda x: quadratic(end, cost.deviation(x))
 
+    def __repr__(self) -> str:
+        over = f"{self.intervals} intervals over {self.horizon:.4g} s, {self.starts} starts"
+        return f"DirectShooting({self.stage.system!r}, {self.stage.cost!r}, {over})"
+
     @opaque
     @without_gradient("DirectShooting.solve", "x0", "self")
+    @Sign("DirectShooting")
     def solve(self, x0: Tensor, *, warm: Optimum | None = None) -> Optimum:
         """The optima from x0, (B, n).
 
@@ -224,10 +230,12 @@ class DirectShooting:
             ValueError: if x0 is no batch of states of the plant.
         """
         trailing("DirectShooting.solve", "x0", x0, dims=2, last=self.stage.system.dim)
-        parts = [
-            self._solve(rows, None if warm is None else selected(warm, k * ROWS + torch.arange(len(rows))))
-            for k, rows in enumerate(x0.split(ROWS))
-        ]
+        parts = list[Optimum]()
+        with Sign("", len(x0), "states") as sign:
+            for k, rows in enumerate(x0.split(ROWS)):
+                at = k * ROWS + torch.arange(len(rows))
+                parts.append(self._solve(rows, None if warm is None else selected(warm, at)))
+                sign.advance(len(rows))
         return parts[0] if len(parts) == 1 else joined(parts)
 
     def _solve(self, x0: Tensor, warm: Optimum | None) -> Optimum:

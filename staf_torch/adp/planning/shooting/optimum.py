@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
+from ....numerics.shown import span
 from ...loop.controller import Controller
 
 
@@ -39,13 +39,11 @@ class Optimum(NamedTuple):
 
     def __repr__(self) -> str:
         rows, times = self.state.shape[:2]
-        value = self.value[torch.isfinite(self.value)]
-        span = "none found" if not len(value) else f"{float(value.min()):.6g} to {float(value.max()):.6g}"
         found = int(self.converged.sum())
         why = sorted({reason for reason in self.reason if reason})
         more = f"; {why[0]}" + (f" (and {len(why) - 1} more reasons)" if len(why) > 1 else "") if why else ""
         return (
-            f"Optimum({rows} states, value {span}, {found} converged, {times - 1} intervals over "
+            f"Optimum({rows} states, value {span(self.value)}, {found} converged, {times - 1} intervals over "
             f"{float(self.time[-1]):.4g} s{more})"
         )
 

@@ -1,0 +1,112 @@
+"""Signs of life: what a call says that takes long, where, and that short ones say nothing."""
+
+from __future__ import annotations
+
+import io
+import logging
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from command_line import environment
+
+from staf_torch import signs
+from staf_torch.signs import Sign
+
+WAIT = signs.FIRST + 0.6
+
+
+class Terminal(io.StringIO):
+    """Where bars are shown."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def long_call() -> None:
+    """Two rounds, in the second of which something is compiled."""
+    with Sign("a value", 2, "rounds") as sign:
+        sign.advance()
+        with Sign("compiling 3 lines"):
+            time.sleep(WAIT)
+
+
+def test_a_line_says_what_is_going_on_and_how_far_it_is(capsys: pytest.CaptureFixture[str]) -> None:
+    long_call()
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err == "a value: 50 % of 2 rounds, 2 s left; compiling 3 lines (2 s so far)\n"
+
+
+def test_a_log_that_takes_it_has_the_line_and_one_that_takes_nothing_none(
+    capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.INFO, "staf_torch"):
+        long_call()
+    (line,) = caplog.messages
+    assert line.startswith("a value: 50 %")
+    with caplog.at_level(logging.ERROR, "staf_torch"):
+        long_call()
+    assert capsys.readouterr() == ("", "")
+
+
+def test_a_terminal_has_a_bar_under_the_log_that_is_wiped_in_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = Terminal()
+    monkeypatch.setattr(sys, "stderr", shown)
+    handler = logging.StreamHandler(shown)
+    logging.getLogger().addHandler(handler)
+    try:
+        with Sign("a sum", 4, "parts") as sign:
+            sign.advance()
+            while "a sum" not in shown.getvalue():
+                time.sleep(0.05)
+            logging.getLogger("elsewhere").warning("above")
+            time.sleep(0.4)
+    finally:
+        logging.getLogger().removeHandler(handler)
+    found = shown.getvalue()
+    assert found.startswith("\r 25 %|######                  | a sum: 25 % of 4 parts, ")
+    assert "\r\x1b[Kabove\n\r 25 %|" in found
+    assert found.endswith("\r\x1b[K")
+
+
+def test_short_calls_say_nothing_however_many(capsys: pytest.CaptureFixture[str]) -> None:
+    @Sign("short")
+    def short() -> None:
+        time.sleep(0.1)
+
+    end = time.monotonic() + WAIT
+    while time.monotonic() < end:
+        short()
+    assert capsys.readouterr() == ("", "")
+    for _ in range(20):
+        time.sleep(0.1)
+        if not any(thread.name == "staf_torch.signs" for thread in threading.enumerate()):
+            break
+    else:
+        pytest.fail("the thread that looks goes on")
+
+
+def test_a_script_sees_its_call_and_not_those_of_its_workers(tmp_path: Path) -> None:
+    (tmp_path / "script.py").write_text(
+        """
+import multiprocessing, time
+from staf_torch.signs import Sign
+def work():
+    with Sign("in a worker"):
+        time.sleep(2.2)
+if __name__ == "__main__":
+    process = multiprocessing.get_context("spawn").Process(target=work)
+    process.start()
+    with Sign("a call"):
+        process.join()
+"""
+    )
+    command = [sys.executable, str(tmp_path / "script.py")]
+    found = subprocess.run(command, env=environment(), capture_output=True, text=True, check=True)
+    assert found.stdout == ""
+    assert found.stderr.startswith("a call (2 s so far)\n")
+    assert "worker" not in found.stderr
