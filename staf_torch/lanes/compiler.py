@@ -35,6 +35,7 @@ _ROUNDED_AS_WRITTEN = ("-ffp-contract=off", "-fno-math-errno", "-fno-trapping-ma
 _OF_PROGRAMS = ("-O2", *_SHARED, "-w", *_ROUNDED_AS_WRITTEN)
 # A long program takes GCC half the time without what looks at all of its loops and branches together.
 _LONG, _OF_LONG = 1500, ("-fira-region=one", "-fno-tree-pre", "-fno-gcse")  # lines
+_SLOW = 6000  # lines from which a build may take its whole time
 _DIGEST = 32  # bytes at the end of a library in the cache
 _one_at_a_time = Mutex()  # threads of a chase ask for the same at the same time
 _said: set[str] = set()  # what has been logged
