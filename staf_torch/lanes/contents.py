@@ -51,6 +51,7 @@ _log = logging.getLogger(__name__)
 _said: set[tuple[str, str]] = set()  # what has been logged
 _MISSING = object()
 _EMPTY = object()  # in a cell whose name has no value yet
+_REQUIRES = operator.attrgetter("requires_grad")
 BOUND = "_compiled_methods"
 """Attribute in which an object holds its compiled methods: no part of what it is."""
 
@@ -137,7 +138,7 @@ class Contents:
 
     def wants_gradient(self) -> bool:
         """Return whether autograd is on, and one of the tensors requires a gradient."""
-        return torch.is_grad_enabled() and True in [tensor.requires_grad for tensor in self.tensors]
+        return torch.is_grad_enabled() and any(map(_REQUIRES, self.tensors))
 
     def warn(self, name: str) -> None:
         """Log, once, what cannot be watched."""
