@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import pytest
 import torch
@@ -16,6 +16,7 @@ import staf_torch as st
 from staf_torch import adp, optim, predictors, systems, targets
 
 Point = list[float]
+T = TypeVar("T")
 
 
 def dot(y: Point, c: Point) -> float:
@@ -259,3 +260,8 @@ CONTROLLERS: dict[str, Callable[..., adp.Controller]] = {  # of two states and a
 def over(variants: Iterable[str], name: str = "name") -> pytest.MarkDecorator:
     """`pytest.mark.parametrize` over the keys of one of the tables above."""
     return pytest.mark.parametrize(name, list(variants))
+
+
+def by_turns(variants: Iterable[str], values: Sequence[T]) -> list[tuple[str, T]]:
+    """Every variant beside one of the values, each value in its turn, where a product would show no more."""
+    return [(name, values[k % len(values)]) for k, name in enumerate(variants)]

@@ -13,7 +13,7 @@ from helpers import basis_of, tensor, uniform
 from helpers_layers import MODES, as_function, evaluated, fixed, learnable, target_of
 from torch import nn
 from variants import KERNELS as FIXED
-from variants import LEARNABLE_KERNELS, SMOOTH_KERNELS, learned, over
+from variants import LEARNABLE_KERNELS, SMOOTH_KERNELS, by_turns, learned, over
 from variants import RADII as FIXED_RADII
 
 import staf_torch as st
@@ -39,8 +39,7 @@ def test_every_output_is_what_it_would_be_alone(name: str) -> None:
             torch.testing.assert_close(together.hessian(y)[..., k, :, :], alone.hessian(y))
 
 
-@over(FIXED)
-@pytest.mark.parametrize("outputs", [None, 2])
+@pytest.mark.parametrize(("name", "outputs"), by_turns(FIXED, [None, 2]))
 def test_points_and_approximations_broadcast(name: str, outputs: int | None) -> None:
     trailing = () if outputs is None else (outputs,)
     one, many = fixed(name, (), outputs), fixed(name, (4,), outputs)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from helpers import basis_of, tensor, uniform
 from torch import Tensor, nn
-from variants import KERNELS, RADII, over
+from variants import KERNELS, RADII, by_turns, over
 
 import staf_torch as st
 from staf_torch.approximation.sensitivity import state_jacobian, weight_jacobian
@@ -55,8 +55,9 @@ def test_weight_jacobian_is_what_differences_of_the_dense_solution_give(kernel: 
         assert_close(row, central_differences(basis, basis.centers(at), 1e-3), 1e-6)
 
 
-@over(KERNELS, "kernel")
-@over(RADII, "radius")
+@pytest.mark.parametrize(
+    ("kernel", "radius"), [*by_turns(KERNELS, list(RADII)), *by_turns(KERNELS, list(RADII)[::-1])]
+)
 def test_state_jacobian_is_that_of_the_ideal_weights(kernel: str, radius: str) -> None:
     basis = basis_of(kernel, 3, RADII[radius][0]())
     x = uniform(3, 2, seed=5) + tensor([0.9, 0.2])

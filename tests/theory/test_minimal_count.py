@@ -12,7 +12,7 @@ from helpers import basis_of, tensor, uniform
 from helpers_theory import random_offsets
 from torch import Tensor
 from truth import Truth, smooth
-from variants import KERNELS, over
+from variants import KERNELS, by_turns, over
 
 import staf_torch as st
 from staf_torch import (
@@ -182,8 +182,7 @@ POWER_LAYOUTS = {
 
 
 @pytest.mark.parametrize("radius", [1e-8, 0.1, 0.5])
-@pytest.mark.parametrize("width", [None, 0.7])
-@pytest.mark.parametrize("layout", POWER_LAYOUTS)
+@pytest.mark.parametrize(("layout", "width"), by_turns(POWER_LAYOUTS, [None, 0.7]))
 def test_power_function_keeps_its_digits_at_every_radius(
     layout: str, width: float | None, radius: float
 ) -> None:
