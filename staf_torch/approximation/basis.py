@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from ..centers import StateFollowingCenters
 from ..kernels import Kernel
 from ..local_basis import Degrees, LocalBasis, LocalSpace
-from ..numerics.checks import sampled, trailing
+from ..numerics.checks import sampled, trailing, values_of
 from .coefficient_format import compare, decode, encode, record
 
 Target = Callable[[Tensor], Tensor]
@@ -119,8 +119,8 @@ class StaFBasis(nn.Module):
         The first evaluation at y = x warns where sigma(x; x) is the same at every state: `check_own_value`.
         """
         trailing("StaFBasis", "y", y, dims=2, last=self.dim)
-        if self._unseen and not torch.compiler.is_compiling() and _same(y, x):
-            self.check_own_value(x, stacklevel=5)
+        if self._unseen and _same(y, x):
+            self.check_own_value(x.detach(), stacklevel=5)
         sigma: Tensor = self.kernel(y, self.centers(x)).to(torch.promote_types(y.dtype, x.dtype))
         return sigma
 
@@ -178,7 +178,8 @@ class StaFBasis(nn.Module):
         are called; found by evaluation at the states x (..., n), at four around each and at the origin.
         """
         self._unseen = False
-        change = torch.inf if x.is_meta else self._own_change(x)
+        states = values_of(x)
+        change = torch.inf if states is None else self._own_change(states)
         if change > 1e-7:
             return False
         kernel = type(self.kernel).__name__
@@ -206,7 +207,8 @@ class StaFBasis(nn.Module):
     @torch.no_grad()
     def _own_change(self, x: Tensor) -> float:
         """The largest change of sigma(x; x) between states, of its largest entry; inf where not finite."""
-        at = torch.where(torch.isfinite(x), x, 0.0).double()
+        at = x if x.shape[-1] == self.dim else x.new_zeros(self.dim)  # a batch of `vmap` may come last
+        at = torch.where(torch.isfinite(at), at, 0.0).double()
         axis = torch.arange(1, self.dim + 1, dtype=at.dtype, device=at.device)
         size = 1 + at.norm(dim=-1, keepdim=True)
         around = [at + s * size * (s * axis).cos() for s in (0.1, 0.5, 1.0, 3.0)]
@@ -214,7 +216,8 @@ class StaFBasis(nn.Module):
             [self.kernel(p.unsqueeze(-2), self.centers(p)) for p in (at, torch.zeros_like(at), *around)]
         )
         change = (found - found[:1]).abs().amax() / found.abs().amax().clamp(min=torch.finfo(at.dtype).tiny)
-        return float(torch.where(torch.isfinite(change), change, torch.inf))
+        seen = values_of(change)  # one each where `vmap` runs over hyperparameters
+        return torch.inf if seen is None else float(torch.where(torch.isfinite(seen), seen, torch.inf).max())
 
     def values(self, x: Tensor, target: Target, outputs: int | None = None) -> Tensor:
         """V(c(x)): (..., n) -> (..., M); of a target with k outputs (k, ..., M).
@@ -305,9 +308,12 @@ class StaFBasis(nn.Module):
 
 
 def _same(y: Tensor, x: Tensor) -> bool:
-    """Return whether the points y (..., P, n) are the states x themselves, in plain tensors with values."""
-    if y.shape not in (x.shape, x.unsqueeze(-2).shape) or y.numel() == 0 or y.is_meta:
+    """Return whether the points y (..., P, n) are the states x themselves, as far as values can be seen."""
+    if y.shape not in (x.shape, x.unsqueeze(-2).shape) or y.numel() == 0:
         return False
-    if torch._C._functorch.peek_interpreter_stack() is not None or torch._C._len_torch_dispatch_stack():
+    points, states = values_of(y), values_of(x)
+    if points is None or states is None:
         return False
-    return y.data_ptr() == x.data_ptr() or (y.is_cpu and torch.equal(y.reshape(x.shape), x))
+    return points.data_ptr() == states.data_ptr() or (
+        points.is_cpu and torch.equal(points.flatten(), states.flatten())
+    )

@@ -202,7 +202,8 @@ def kept(module: nn.Module, name: str, *, zero: bool = False, squared: bool = Fa
             inside = (value >= least if zero else value > least) & (value < math.inf)
             torch._assert_async(inside.all(), f"{rule}.")
         return value
-    for number in [plain.item()] if plain.dim() == 0 else plain.flatten().tolist():
+    extremes = (plain,) if plain.dim() == 0 else plain.aminmax() if plain.numel() else ()
+    for number in [extreme.item() for extreme in extremes]:  # NaN is both
         if not least <= number < math.inf or (number == least and not zero):
             raise ValueError(
                 f"{rule}; got {number:.6g}. Take smaller steps, or learn its logarithm, with which it cannot "
