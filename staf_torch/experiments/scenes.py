@@ -20,6 +20,7 @@ from ..numerics.checks import COMMAND_LINE, choice, fail
 from ..results.run_directory import RunDirectory
 from ..settings.chase import ChaseProblem
 from ..settings.plain import PlainSettings
+from ..systems import Units
 
 _GRID, _ACROSS = 81, 41
 
@@ -74,6 +75,7 @@ def chase_scene(problem: ChaseProblem, drawn: Mapping[str, np.ndarray]) -> Scene
         value=_array(value),
         estimate=_array(estimate),
         grid=grid,
+        units=getattr(problem.system, "units", Units()).of_states(x.shape[-1]),
     )
 
 
@@ -93,7 +95,8 @@ def loop_scene(problem: AdpProblem, result: LoopResult) -> Scene:
     optimum = None if known_value(problem, problem.initial_states) is None else known
     # The state is fast at first and then rests: half of the frames are of the first quarter of the time.
     at = frames(_moves_until(result.state[0]), 2)
-    return _scene(problem.controller, result, at, optimum)
+    scene = _scene(problem.controller, result, at, optimum)
+    return scene._replace(units=problem.system.units.of_states(result.state.shape[-1]))
 
 
 def tracking_scene(controller: Controller, result: LoopResult) -> Scene:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from .loop import with_unit
 from .style import FigurePaper, colour
 
 if TYPE_CHECKING:
@@ -51,6 +52,7 @@ class Scene(NamedTuple):
     grid: tuple[np.ndarray, np.ndarray, np.ndarray] | None  # x1 (G,), x2 (G,) and V (G, G), rows along x2
     followed: np.ndarray | None = None  # (F, 2) the state that is to be tracked
     discs: np.ndarray | None = None  # (F, K, 3) centers and radii of sets that must not be entered
+    units: tuple[str, ...] = ("", "")  # of the states
     relative: bool = False  # V is an optimal value; V and V^ as shares of its largest in a ball that shrinks
 
 
@@ -132,7 +134,8 @@ class AnimationStage:
         scene = self._scene
         if scene.grid is not None:
             axes.contour(*scene.grid, levels=_LEVELS, colors="0.75", linewidths=0.7)
-        axes.set(xlabel="$x_1$", ylabel="$x_2$", aspect="equal")
+        names = (with_unit(f"$x_{i + 1}$", unit) for i, unit in enumerate(scene.units[:2]))
+        axes.set(**dict(zip(("xlabel", "ylabel"), names, strict=True)), aspect="equal")
         axes.set_title(scene.title, loc="left")
         (self._path,) = axes.plot([], [], color="0.45", linewidth=0.8)
         self._goal = None
