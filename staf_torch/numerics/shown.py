@@ -22,7 +22,7 @@ def shown(value: Any) -> str:
         return f"{value:.4g}"
     if value.numel() > _MOST:
         return f"a tensor {tuple(value.shape)}"
-    if value.dim() == 2 and len(value) == value.shape[1] and torch.equal(value, value.diag().diag()):
+    if value.dim() == 2 and 1 < len(value) == value.shape[1] and torch.equal(value, value.diag().diag()):
         return f"diag({', '.join(map(shown, value.diag().tolist()))})"
     return _listed(value.tolist())
 

@@ -17,6 +17,7 @@ from ..lanes.tree import Tree
 from ..numerics.checks import integer, positive_real, trailing
 from ..numerics.exponential_step import BENT, GRACE, MOST, TOLERANCE, TRIED, needed_steps
 from ..numerics.runge_kutta import runge_kutta_mean, runge_kutta_stages
+from ..signs import Sign
 from .base import ControlAffineSystem
 
 _log = logging.getLogger(__name__)
@@ -163,6 +164,7 @@ def _refined(
 
 
 @opaque
+@Sign("systems.simulate")
 def simulate(system: ControlAffineSystem, x0: Tensor, *, dt: float, steps: int) -> Tensor:
     """The whole of `trajectory` at once: (B, n) -> (B, steps + 1, n).
 

@@ -452,3 +452,30 @@ def test_a_bound_is_met_where_the_base_reaches_it_within_the_horizon() -> None:
     # It grows by a half a period: 0.4, 0.6, 0.9, 1.35, 2.025 in the fifth.
     assert meets(1.0, 0.4) == [0.0]
     assert meets(1.0, 0.4, steps=5) == [1.0]
+
+
+def test_a_repr_of_a_few_lines_says_what_a_user_needs() -> None:
+    plant, near = (
+        systems.Pendulum(),
+        adp.QuadraticCost(1.0, 2.0, dim=2, inputs=1, low=-8.0, target=[0.0, 0.0]),
+    )
+    lqr = adp.LQR(systems.Linear([[0.0]], [[1.0]]), adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1), period=0.1)
+    shown = {
+        plant: "Pendulum(2 states, 1 input, damping=0.1)",
+        systems.StepPlant(
+            lambda x, u: x + u, dim=1, inputs=1, dt=0.1
+        ): "StepPlant(1 state, 1 input, period=0.1 s)",
+        near: "QuadraticCost(2 states, 1 input, state=diag(1, 1), control=diag(2), low=[-8], high=[inf], "
+        "target=[0, 0])",
+        lqr: "LQR(K=[[0.9512]], period=0.1 s)",
+        adp.SafetyFilter(lambda x: -x[..., :1], plant, lambda x, t: 1 - x[..., 0], dt=0.02, decay=5.0): (
+            "SafetyFilter(around <lambda>, Pendulum(2 states, 1 input, damping=0.1), held for 0.02 s, "
+            "1 constraint, decay=[5] 1/s)"
+        ),
+    }
+    for thing, wanted in shown.items():
+        assert repr(thing) == wanted
+    policy = adp.near_optimal(plant, near, dt=0.05, reach="local")
+    first, *others = repr(policy).splitlines()
+    assert first == "NearOptimal(Pendulum, 2 states, 1 input, held for 0.05 s,"
+    assert len(others) == 4
