@@ -465,9 +465,9 @@ def test_a_repr_of_a_few_lines_says_what_a_user_needs() -> None:
         systems.StepPlant(
             lambda x, u: x + u, dim=1, inputs=1, dt=0.1
         ): "StepPlant(1 state, 1 input, period=0.1 s)",
-        near: "QuadraticCost(2 states, 1 input, state=diag(1, 1), control=diag(2), low=[-8], high=[inf], "
+        near: "QuadraticCost(2 states, 1 input, state=diag(1, 1), control=[[2]], low=[-8], high=[inf], "
         "target=[0, 0])",
-        lqr: "LQR(K=[[0.9512]], period=0.1 s)",
+        lqr: "LQR(K=[[0.952]], period=0.1 s)",
         adp.SafetyFilter(lambda x: -x[..., :1], plant, lambda x, t: 1 - x[..., 0], dt=0.02, decay=5.0): (
             "SafetyFilter(around <lambda>, Pendulum(2 states, 1 input, damping=0.1), held for 0.02 s, "
             "1 constraint, decay=[5] 1/s)"
