@@ -170,7 +170,7 @@ def completion(cfg: DictConfig, outcome: Outcome) -> Experiment:
         Exception: that of a job that failed, or ValueError for an animation that the experiment has not.
     """
     check_animation(cfg)
-    paper, study = FigurePaper.of(cfg.figures), experiment(cfg.task)
+    paper, study = FigurePaper.of(cfg.get("figures", True)), experiment(cfg.task)
 
     def left(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
         with printed_on(paper):
