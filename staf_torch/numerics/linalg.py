@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from .checks import fail
+from .threads import alone
 
 
 def condition_number(gram: Tensor) -> Tensor:
@@ -212,5 +213,6 @@ def exponential(matrix: Tensor) -> Tensor:
     six digits there; not for several (https://github.com/pytorch/pytorch/issues/196592).
     """
     several = matrix.numel() > matrix.shape[-1] ** 2
-    found: Tensor = torch.linalg.matrix_exp(matrix if several else torch.stack((matrix, matrix)))
+    with alone(matrix.numel()):
+        found: Tensor = torch.linalg.matrix_exp(matrix if several else torch.stack((matrix, matrix)))
     return found if several else found[0]
