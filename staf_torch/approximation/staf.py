@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from ..lanes.gradients import refuse_gradient
 from ..numerics.checks import choice, fail, flag, hold, integer, trailing
 from ..numerics.linalg import row_jacobian
 from .basis import StaFBasis, Target
@@ -133,14 +134,15 @@ class StaF(nn.Module):
         `StaFBasis.local` has one that does.
 
         Raises:
-            ValueError: if x is not of the shape (*batch_shape, n), or the target returns another shape; the
-                module then stays as it was.
+            ValueError: if x is not of the shape (*batch_shape, n), the target returns another shape, or one
+                requires a gradient; the module then stays as it was.
         """
         trailing("StaF.fit_", "x", x, dims=1, last=self.basis.dim)
         if x.shape != self.state.shape:
             raise ValueError(
                 f"`StaF.fit_(x=...)` must have the shape {tuple(self.state.shape)}; got {tuple(x.shape)}."
             )
+        refuse_gradient("StaF.fit_", x=x, target=target)
         with torch.no_grad():
             x = _wide(x.to(self.state))
             self.basis.check_reach(x)

@@ -17,6 +17,7 @@ from ..adp import Controller, Cost, Feedback, QuadraticCost
 from ..adp.loop.controller import Carried, Policy
 from ..adp.loop.simulation import uniform_numbers
 from ..adp.loop.step import ClosedLoop, LoopState
+from ..lanes.gradients import refuse_gradient
 from ..numerics.checks import choice, fail, positive_real
 from ..systems import Bounds, ControlAffineSystem, Plant
 
@@ -181,6 +182,7 @@ class Episodes:
         wanted = (len(self.state), self.loop.cost.inputs)
         if u.shape != wanted:
             raise fail("Episodes.step", "u", f"must have the shape {wanted}", tuple(u.shape))
+        refuse_gradient("Episodes.step", u=u)
         alive = torch.ones_like(self.age, dtype=torch.bool)
         none = self.state.new_zeros(len(u))
         before = LoopState(self.state, none, alive, self.age, none, u.to(self.state))

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from ..approximation.basis import StaFBasis
+from ..lanes.gradients import refuse_gradient
 from ..lanes.locks import ReadWriteLock
 from ..numerics.checks import hold, integer, positive_real, trailing
 
@@ -103,7 +104,7 @@ class ExperienceMemory(nn.Module):
         An entry whose state or coefficients are not finite stores nothing.
 
         Raises:
-            ValueError: if a shape is not (*batch_shape, n) or (*batch_shape, M).
+            ValueError: if a shape is not (*batch_shape, n) or (*batch_shape, M), or a gradient is required.
         """
         batch = self.stored.shape[:-1]
         for name, value, last in (("x", x, self.basis.dim), ("coefficients", coefficients, self.basis.count)):
@@ -112,6 +113,7 @@ class ExperienceMemory(nn.Module):
                     f"`ExperienceMemory.add({name}=...)` must have the shape {(*batch, last)}; "
                     f"got {tuple(value.shape)}."
                 )
+        refuse_gradient("ExperienceMemory.add", x=x, coefficients=coefficients)
         self._lock.write(self._add, x, coefficients)
         return self
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from ..centers import ball, rings
 from ..centers.layouts import RING_COUNTS
 from ..kernels import NAMED, Kernel
+from ..lanes.gradients import refuse_gradient
 from ..numerics.checks import choice, fail, flag, integer, positive_real, real
 from ..signs import Sign
 from .estimator import StreamEstimator, Streams
@@ -279,5 +280,6 @@ def _check_reach(functions: LocalFunctions, radius: float) -> None:
 
 def _kernel(stated: Kernel | str) -> Kernel:
     if isinstance(stated, Kernel):
+        refuse_gradient(_NAME, kernel=stated)
         return copy.deepcopy(stated).double().requires_grad_(False)
     return NAMED[str(choice(_NAME, "kernel", stated, tuple(NAMED)))]()

@@ -11,7 +11,7 @@ from helpers import tensor, uniform
 from torch import Tensor, nn
 
 import staf_torch as st
-from staf_torch import adp, systems
+from staf_torch import adp, online, systems
 
 COST = adp.QuadraticCost(1.0, 0.1, dim=2, inputs=1)
 PLANT = systems.Pendulum()
@@ -52,6 +52,7 @@ def samples() -> tuple[Tensor, Tensor]:
 
 PROBLEM = adp.SampledProblem.of(PLANT, COST, dt=0.05)
 BOX = systems.StepPlant(numpy_step, dim=2, inputs=1, dt=0.1)
+BASIS = st.StaFBasis(st.GaussianKernel(), st.StateFollowingCenters(st.rings(3), radius=0.1))
 REGRESSOR = st.StaFRegressor().fit(*samples())
 WITHOUT: dict[str, tuple[Callable[[Tensor], Any], Tensor]] = {
     "adp.simulate controller": (lambda k: loop(lambda x: -x @ k.mT), tensor([[1.0, 2.0]])),
@@ -98,6 +99,12 @@ WITHOUT: dict[str, tuple[Callable[[Tensor], Any], Tensor]] = {
     "Linear matrix": (lambda a: systems.Linear(a, [[0.0], [1.0]]).drift(X0), torch.eye(2).double()),
     "Bounds low": (lambda low: systems.Bounds(low, None, 1).low, tensor([-1.0])),
     "predict x": (REGRESSOR.predict, X0[0]),
+    "add coefficients": (
+        lambda w: online.ExperienceMemory(BASIS, capacity=2).add(X0[0], w),
+        torch.ones(3).double(),
+    ),
+    "fit_ x": (lambda x: st.StaF(BASIS).fit_(x, st.targets.Paper()), X0[0]),
+    "fit_ target": (lambda s: st.StaF(BASIS).fit_(X0[0], lambda x: s * x[..., 0]), tensor(1.0)),
     "fit y": (lambda y: st.StaFRegressor().fit(uniform(20, 2), y), samples()[1]),
 }
 

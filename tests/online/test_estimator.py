@@ -237,9 +237,12 @@ def test_what_was_tuned_holds_for_as_many_streams_and_outputs_alone() -> None:
         assert torch.equal(tuned.fit(of_x, of_y).predict(of_x[3]), untuned.predict(of_x[3]))
 
 
-def test_a_kernel_that_is_learned_elsewhere_asks_for_no_gradient_here() -> None:
+def test_a_kernel_that_is_learned_elsewhere_is_taken_where_nobody_wants_a_gradient() -> None:
     kernel = st.MaternKernel(2.5, torch.nn.Parameter(torch.tensor(0.8)))
-    model = st.StaFRegressor(kernel, 0.4).partial_fit(tensor([0.3, 0.1]), tensor(1.0))
+    with pytest.raises(ValueError, match="`StaFRegressor` computes no gradient, and `kernel` holds a tensor"):
+        st.StaFRegressor(kernel, 0.4).partial_fit(tensor([0.3, 0.1]), tensor(1.0))
+    with torch.no_grad():
+        model = st.StaFRegressor(kernel, 0.4).partial_fit(tensor([0.3, 0.1]), tensor(1.0))
     assert not any(part.requires_grad for part in model.predict(tensor([0.3, 0.2]), return_std=True))
     assert not any(part.requires_grad for part in model.state_dict().values() if hasattr(part, "dtype"))
 
