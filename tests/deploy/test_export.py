@@ -29,7 +29,10 @@ RUNS = {
         *("experiment=adp", "duration=0.1", "dt=0.005", "trajectories=2", "adp.trust=0.5"),
         "adp.record_every=2",
     ],
-    "lqr": ["experiment=adp", "duration=0.1", "dt=0.01", "adp/policy=lqr", "system=pendulum"],
+    "lqr": [
+        *("experiment=adp", "duration=0.1", "dt=0.01", "adp/policy=lqr", "system=pendulum"),
+        "adp.optimum.shooting=false",
+    ],
     "guarded": [
         *("experiment=adp", "adp/basis=quadratic", "duration=0.1", "dt=0.01", "initial_state=[-1.0,0.0]"),
         "adp.walls.high=[null,0.05]",
