@@ -42,10 +42,24 @@ _OWN: Node = {
     "properties": {"_target_": {"type": "string", "not": {"pattern": r"^staf_torch\."}}},
     "required": ["_target_"],
 }
+_FIGURES: Node = {
+    "draw": {"type": "boolean"},
+    "width": {"type": "number", "description": "inches; a column of a paper is 3.4"},
+    "font": {
+        "type": ["number", "string"],
+        "description": "of all text: size in pt, family, or both (9 serif)",
+    },
+}
 _SAID: Mapping[str, Node] = {  # what neither values nor signatures say
     "task": {"anyOf": [{"enum": list(EXPERIMENTS)}, {"type": "string", "pattern": r"\w\.\w"}]},
     "dtype": {"enum": list(DTYPES)},
     "animation": {"enum": [False, True, "gif", "html"]},
+    "figures": {
+        "anyOf": [
+            {"type": "boolean"},
+            {"type": "object", "properties": _FIGURES, "additionalProperties": False},
+        ]
+    },
     "adp.compile": {"enum": [True, False, "auto"]},
     **{f"adp.{name}": {"type": ["number", "array"]} for name in ("critic", "actor", "q", "r")},
 }

@@ -83,7 +83,8 @@ def test_what_is_mistyped_is_not_valid(group: str, settings: Any, whole: dict[st
         ("centers", {"radius": "${spread}", "count": 6}),
         ("experiment", {"task": "closeness.closeness", "defaults": [{"override /kernel": "matern"}]}),
         (".", {"animation": False, "adp": {"q": 1.0}}),
-        (".", {"animation": True}),
+        (".", {"animation": True, "figures": False}),
+        (".", {"figures": {"width": 3.4, "font": "9 serif"}}),
         (".", {"animation": "html", "adp": {"q": [[1.0, 0.0], [0.0, 2.0]]}}),
     ],
 )
