@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
+import json
 import math
 import re
 from collections.abc import Iterator
@@ -143,6 +144,30 @@ def test_page_has_the_table_the_figures_and_the_settings_and_loads_nothing(sweep
     assert "<dt>centers.radius</dt>" not in text  # swept
     assert BAD_COUNT in text.replace("&#x27;", "'")
     assert re.search(r'class="number best"[^>]*>[^<]*', text)
+
+
+def test_page_has_command_date_machine_versions_and_units(tmp_path: Path) -> None:
+    for num, hour in enumerate((9, 7, 8)):
+        path = (
+            write_run(tmp_path / str(num), {"centers.radius": 0.1 + num}, {"settling_time": 1.5}) / "run.json"
+        )
+        facts = {"began": f"2026-11-26T0{hour}:00:00+00:00", "machine": NASTY, "python": "3.11.7"}
+        facts["units"] = {"state": "rad, rad/s", "input": "N m"}
+        path.write_text(json.dumps(json.loads(path.read_text()) | facts))
+    lines = {"overrides": ["centers.radius=0.1,1.1,2.1", "note='two words'"], "hydra": ["hydra.sweep.dir=w"]}
+    (tmp_path / "sweep.json").write_text(json.dumps({"version": "0.2", "jobs": [], **lines}))
+    write_report(tmp_path, figures=False)
+    text = (tmp_path / "report.html").read_text()
+    assert Outline(text).tags.count("script") == 1
+    text = html.unescape(text)
+    for said in (
+        """<dd>staf -m centers.radius=0.1,1.1,2.1 'note='"'"'two words'"'"'' hydra.sweep.dir=w</dd>""",
+        "<dd>2026-11-26T07:00:00+00:00 to 2026-11-26T09:00:00+00:00</dd>",
+        f"<dd>{NASTY}</dd>",
+        "Python 3.11.7",
+        "<dd>state rad, rad/s, input N m</dd>",
+    ):
+        assert said in text
 
 
 def test_page_escapes_whatever_a_setting_holds(tmp_path: Path) -> None:

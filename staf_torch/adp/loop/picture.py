@@ -82,10 +82,12 @@ def summary(result: LoopResult) -> str:
     if about is not None and about.low is not None and about.high is not None:
         bounded = f"; bounds {_numbers(about.low)} to {_numbers(about.high)}"
     far = _far(result)
-    end = "" if far is None else f"|x - wanted| up to {float(far.max()):.3g}, "
+    end = "" if far is None or not len(far) else f"|x - wanted| up to {float(far.max()):.3g}, "
     kept = f"; recorded: {', '.join(result.recorded)}" if result.recorded else ""
     cost = result.cost
-    spread = f"{float(cost.min()):.4g} to {float(cost.max()):.4g}, median {float(cost.median()):.4g}"
+    spread = (
+        f"{float(cost.min()):.4g} to {float(cost.max()):.4g}, median {float(cost.double().quantile(0.5)):.4g}"
+    )
     return "\n".join(
         [
             f"LoopResult: {who}{rows} {'row' if rows == 1 else 'rows'}, {len(result.time)} times, "
@@ -117,12 +119,12 @@ def _ranges(letter: str, values: Tensor, units: Sequence[str]) -> str:
 
 
 def _far(result: LoopResult) -> Tensor | None:
-    """Return the distance of the last states from where they should be, (B,)."""
+    """Return the distance of the last states that are numbers from where they should be, (R,)."""
     about = result.about
     if about is None or about.cost is None:
         return None
     far: Tensor = about.cost.deviation(result.state[:, -1]).norm(dim=-1)
-    return far
+    return far[far.isfinite()]
 
 
 def picture(result: LoopResult, rows: Sequence[int] | None, lqr: bool) -> LoopPicture:
