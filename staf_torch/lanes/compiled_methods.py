@@ -25,6 +25,7 @@ from .call import PlannedCall, ordinary
 from .contents import BOUND, Contents
 from .locks import Mutex
 from .loops import tracing_now
+from .one_thread import ENTRIES, alone
 from .opaque import opaque
 from .plain_time import PlainTime
 from .program import Program
@@ -220,9 +221,11 @@ class CompiledMethod:
 
     def _counted(self, rows: float, x: Tensor, *more: Tree) -> Any:
         """Compute by the definition, the first time with a count of its operations."""
+        few = alone(int(rows) * ENTRIES)
         if self._plain is not None or not undecided() or self._settings.pays == math.inf:
-            return self.definition(x, *more)
-        with PlainTime() as plain:
+            with few:
+                return self.definition(x, *more)
+        with few, PlainTime() as plain:
             found = self.definition(x, *more)
         self._plain = plain, rows
         self._asked = max(self._asked, self._settings.pays * plain.seconds() / plain.build)

@@ -19,6 +19,7 @@ from .emit.c import Names, c_text
 from .emit.cpp import emit
 from .locks import Mutex
 from .loops import scan, tracing_now
+from .one_thread import ENTRIES, alone
 from .opaque import opaque
 from .row_independence import doubt, undrawn
 from .trace.step import Step, trace
@@ -182,12 +183,13 @@ class Program(Derived):
         fixed = given.tree("row", [plain(leaf) for leaf in given.row])
         columns: list[list[Tensor]] = []
         shape: Any = ("fixed", ())
-        for k in range(given.times):
-            at = [leaf.tensor[k] if isinstance(leaf, Shared) else leaf[:, k] for leaf in given.now]
-            carry, out = self.step(carry, given.tree("now", at), fixed)
-            if k % every == 0:
-                parts, shape = flatten(out)
-                columns.append(parts)
+        with alone(given.rows * ENTRIES):
+            for k in range(given.times):
+                at = [leaf.tensor[k] if isinstance(leaf, Shared) else leaf[:, k] for leaf in given.now]
+                carry, out = self.step(carry, given.tree("now", at), fixed)
+                if k % every == 0:
+                    parts, shape = flatten(out)
+                    columns.append(parts)
         stacked = [torch.stack(column, dim=1) for column in zip(*columns, strict=True)]
         return carry, unflatten(shape, iter(stacked))
 

@@ -13,8 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..lanes.one_thread import alone
 from .checks import fail
-from .threads import alone
 
 
 def condition_number(gram: Tensor) -> Tensor:

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from ...lanes import Program, repeat, scan, traced_as
 from ...lanes.gradients import without_gradient
+from ...lanes.one_thread import alone
 from ...lanes.opaque import opaque
 from ...lanes.tree import Tree
 from ...numerics.box import minimum_and_slopes
@@ -148,7 +149,8 @@ class BoxDDP:
         together = max(1, _NUMBERS // (self.steps * (n + 1) * (n + m) ** 2))
         whole = x0, self.problem.admissible(control), *reference, *ends
         if len(x0) <= together:
-            return self._solve(*whole)
+            with alone(len(x0) * self.steps * (n + m) ** 2):
+                return self._solve(*whole)
         parts = [self._solve(*some) for some in zip(*(part.split(together) for part in whole), strict=True)]
         return Trajectories(*(torch.cat(column) for column in zip(*parts, strict=True)))
 

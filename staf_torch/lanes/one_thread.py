@@ -10,6 +10,8 @@ from typing import Any
 
 import torch
 
+ENTRIES = 512
+"""Entries that a row of a program is taken to have, the most in an operation."""
 _GRAIN = 32768  # entries from which torch itself takes a second thread for an operation entry by entry
 
 
