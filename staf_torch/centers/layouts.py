@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ..numerics.checks import choice, integer
+from ..signs import Sign
 
 # count -> (points, radius) of each ring, from the outside in.
 # Source: L. Bos, concentric spheres unisolvent for polynomials in the plane; MATH.md section 1.
@@ -151,6 +152,7 @@ def cross_polytope(dim: int) -> Tensor:
     return torch.stack((axes, -axes), dim=1).reshape(2 * dim, dim)
 
 
+@Sign("ball")
 def ball(count: int, dim: int) -> Tensor:
     """Approximate Fekete points of the closed unit ball.
 

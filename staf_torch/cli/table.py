@@ -12,6 +12,7 @@ from pathlib import Path
 from ..results.files import RUNNING, UNFINISHED, write_bytes
 from ..results.reader import Collection, collect
 from ..results.untrusted import visible
+from ..signs import Sign
 from ..tables import Layout, Print, Style, Table, json_text, latex_text, parquet_bytes, tabulate
 from ..tables.aggregate import AGGREGATES
 from ..tables.latex import parts
@@ -63,6 +64,7 @@ def _going_on(paths: Sequence[Path]) -> bool:
     return waiting or any(run.status in (RUNNING, UNFINISHED) for run in found.rows)
 
 
+@Sign("staf-table", log=False)
 def _once(options: argparse.Namespace) -> int:
     try:
         found = collect(options.path)

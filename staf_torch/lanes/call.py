@@ -17,11 +17,13 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from ..signs import Sign
 from .compiler import compiled
 from .tree import Shared, Tree, flatten, plain, unflatten
 
 LARGE = 2**22  # bytes from which pages of two megabytes are worth asking for
 _HUGE = 2**21
+_MANY = 2**20  # rows times steps of a call that may take long
 
 
 def fresh(like: Tensor, *shape: int) -> Tensor:
@@ -125,7 +127,7 @@ class PlannedCall:
         steps: int,
         every: int,
     ) -> None:
-        self._compiled, self.structure = compiled, compiled.structure
+        self._compiled, self.structure, self._rows_and_times = compiled, compiled.structure, rows * steps
         self._copied: list[int] = []  # inputs of another dtype, or without one stride from entry to entry
         self._large: list[int] = []
         slots = [
@@ -183,7 +185,11 @@ class PlannedCall:
             shape, strides = self._rooms[k]
             rooms[k] = fresh(self._like, torch.Size(shape).numel()).as_strided(shape, strides)
         addresses = self._packed(*map(_address, given), *map(_address, rooms))
-        self._compiled.call(self._reference, addresses, torch.get_num_threads())
+        if self._rows_and_times < _MANY:
+            self._compiled.call(self._reference, addresses, torch.get_num_threads())
+        else:
+            with Sign("compiled code"):
+                self._compiled.call(self._reference, addresses, torch.get_num_threads())
         for k, dtype in self._dtypes:
             rooms[k] = rooms[k].to(dtype)
         return rooms
