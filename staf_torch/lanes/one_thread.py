@@ -27,8 +27,7 @@ def alone(entries: int) -> Iterator[None]:
         entries: of the tensors; from `_GRAIN` on nothing changes.
     """
     openmp = None if entries >= _GRAIN or torch.compiler.is_compiling() else _openmp()
-    before = 1 if openmp is None else openmp.omp_get_max_threads()
-    if before == 1:
+    if openmp is None or (before := openmp.omp_get_max_threads()) == 1:
         yield
         return
     openmp.omp_set_num_threads(1)
