@@ -50,7 +50,7 @@ class Quadratic(nn.Module):
     def __init__(self, matrix: float | Sequence[Sequence[float]] | Tensor = 1.0) -> None:
         super().__init__()
         entries: float | Tensor = matrix if not isinstance(matrix, Sequence) else _square(matrix)
-        p = torch.as_tensor(number("Quadratic", "matrix", entries), dtype=torch.float64)
+        p = torch.as_tensor(number("Quadratic", "matrix", entries), dtype=torch.float64, device="cpu")
         if p.dim() not in (0, 2) or (p.dim() == 2 and p.shape[0] != p.shape[1]):
             raise fail("Quadratic", "matrix", "must be a number or (n, n)", matrix)
         if p.dim() == 2 and not torch.equal(p, p.mT):
@@ -84,13 +84,13 @@ class Cosine(nn.Module):
     def __init__(self, frequency: float | Sequence[float] = 1.0, phase: float = 0.0) -> None:
         super().__init__()
         if isinstance(frequency, Sequence):
-            a = torch.tensor(vector("Cosine", "frequency", frequency), dtype=torch.float64)
+            a = torch.tensor(vector("Cosine", "frequency", frequency), dtype=torch.float64, device="cpu")
         else:
-            a = torch.tensor(real("Cosine", "frequency", frequency), dtype=torch.float64)
+            a = torch.tensor(real("Cosine", "frequency", frequency), dtype=torch.float64, device="cpu")
         self.register_buffer("frequency", a)
         self.frequency: Tensor
         # A tensor, so that a compiled program serves every phase; frequency alone is in a state_dict.
-        number = torch.tensor(real("Cosine", "phase", phase), dtype=torch.float64)
+        number = torch.tensor(real("Cosine", "phase", phase), dtype=torch.float64, device="cpu")
         self.register_buffer("phase", number, persistent=False)
         self.phase: Tensor
 
@@ -99,4 +99,6 @@ class Cosine(nn.Module):
 
 
 def _square(rows: Sequence[Sequence[float]]) -> Tensor:
-    return torch.tensor([vector("Quadratic", "matrix", row, len(rows)) for row in rows], dtype=torch.float64)
+    return torch.tensor(
+        [vector("Quadratic", "matrix", row, len(rows)) for row in rows], dtype=torch.float64, device="cpu"
+    )

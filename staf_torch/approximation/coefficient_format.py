@@ -61,7 +61,7 @@ def described(module: nn.Module) -> str:
 
 def encode(record: dict[str, Any]) -> Tensor:
     """Return a record as a uint8 tensor of JSON, which every tool that handles a state_dict can carry."""
-    return torch.tensor(list(json.dumps(record, sort_keys=True).encode()), dtype=torch.uint8)
+    return torch.tensor(list(json.dumps(record, sort_keys=True).encode()), dtype=torch.uint8, device="cpu")
 
 
 def decode(call: str, stored: Tensor) -> dict[str, Any]:

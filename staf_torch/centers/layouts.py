@@ -31,7 +31,7 @@ _EXCHANGES = 2000
 
 def _circle(count: int) -> Tensor:
     """(sin, cos) of equally spaced angles, from (0, 1) clockwise, as in the paper: (count, 2)."""
-    angle = torch.arange(count, dtype=torch.float64) * (2 * math.pi / max(1, count))
+    angle = torch.arange(count, dtype=torch.float64, device="cpu") * (2 * math.pi / max(1, count))
     return torch.stack((angle.sin(), angle.cos()), dim=-1)
 
 
@@ -116,7 +116,7 @@ def simplex(dim: int) -> Tensor:
     """
     integer("simplex", "dim", dim, least=1)
     # Corner k: coordinates built one axis at a time; each axis leaves the rest a smaller simplex.
-    points = torch.zeros(dim + 1, dim, dtype=torch.float64)
+    points = torch.zeros(dim + 1, dim, dtype=torch.float64, device="cpu")
     for axis in range(dim):
         rest = dim - axis
         height = math.sqrt(max(0.0, 1.0 - float(points[axis].square().sum())))
@@ -148,7 +148,7 @@ def cross_polytope(dim: int) -> Tensor:
         ValueError: if ``dim`` is not a positive integer.
     """
     integer("cross_polytope", "dim", dim, least=1)
-    axes = torch.eye(dim, dtype=torch.float64)
+    axes = torch.eye(dim, dtype=torch.float64, device="cpu")
     return torch.stack((axes, -axes), dim=1).reshape(2 * dim, dim)
 
 
@@ -183,7 +183,7 @@ def ball(count: int, dim: int) -> Tensor:
     integer("ball", "count", count, least=1)
     integer("ball", "dim", dim, least=1)
     if count == 1:
-        return torch.zeros(1, dim, dtype=torch.float64)
+        return torch.zeros(1, dim, dtype=torch.float64, device="cpu")
     degree = 0
     while math.comb(dim + degree, degree) < count:
         degree += 1
@@ -213,12 +213,12 @@ def probe_points(count: int, dim: int) -> Tensor:
     """
     integer("probe_points", "count", count, least=2)
     if dim == 1:
-        line = torch.linspace(-1, 1, count - 1, dtype=torch.float64).unsqueeze(-1)
+        line = torch.linspace(-1, 1, count - 1, dtype=torch.float64, device="cpu").unsqueeze(-1)
         return torch.cat((line.new_zeros(1, 1), line))
     if dim > 2:
         return _cloud(count - 1, dim)
     inner, middle = (count - 1) // 12, (count - 1) // 4
-    circles = [torch.zeros(1, 2, dtype=torch.float64)]
+    circles = [torch.zeros(1, 2, dtype=torch.float64, device="cpu")]
     for radius, points in ((1.0, count - 1 - middle - inner), (0.75, middle), (0.4, inner)):
         circles.append(radius * _circle(points))
     return torch.cat(circles)
@@ -230,7 +230,7 @@ def exponents(dim: int, degree: int) -> Tensor:
         [combination.count(axis) for axis in range(dim)]
         for combination in itertools.combinations_with_replacement(range(dim), degree)
     ]
-    return torch.tensor(rows, dtype=torch.int64).reshape(-1, dim)
+    return torch.tensor(rows, dtype=torch.int64, device="cpu").reshape(-1, dim)
 
 
 def monomials(points: Tensor, degree: int) -> Tensor:
@@ -248,8 +248,8 @@ def _cloud(size: int, dim: int) -> Tensor:
     root = 2.0
     for _ in range(64):  # the positive root of g^(dim + 2) = g + 1: Roberts' generalised golden ratio
         root = (1 + root) ** (1 / (dim + 2))
-    steps = torch.tensor([root ** -(k + 1) for k in range(dim + 1)], dtype=torch.float64)
-    index = torch.arange(1, size + 1, dtype=torch.float64)
+    steps = torch.tensor([root ** -(k + 1) for k in range(dim + 1)], dtype=torch.float64, device="cpu")
+    index = torch.arange(1, size + 1, dtype=torch.float64, device="cpu")
     uniform = (0.5 + index[:, None] * steps) % 1
     normal = torch.special.ndtri(uniform[:, :dim].clamp(1e-9, 1 - 1e-9))
     sphere = normal / normal.norm(dim=-1, keepdim=True)
@@ -268,7 +268,7 @@ def _pivot_rows(matrix: Tensor, count: int) -> Tensor:
         chosen.append(row)
         direction = rest[row] / rest[row].norm()
         rest = rest - (rest @ direction)[:, None] * direction
-    return torch.tensor(chosen, dtype=torch.int64)
+    return torch.tensor(chosen, dtype=torch.int64, device="cpu")
 
 
 def _exchange(matrix: Tensor, chosen: Tensor) -> Tensor:

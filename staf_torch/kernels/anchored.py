@@ -33,7 +33,7 @@ class AnchoredKernel(Kernel):
         super().__init__()
         if not isinstance(kernel, Kernel):
             raise ValueError(f"`AnchoredKernel(kernel=...)` must be a Kernel; got {type(kernel).__name__}.")
-        zero = torch.zeros(1, 1, dtype=torch.float64)
+        zero = torch.zeros(1, 1, dtype=torch.float64, device="cpu")
         corner = kernel(zero, zero)
         if not corner.is_meta and not bool((corner > 0).all()):
             raise ValueError(

@@ -62,7 +62,7 @@ class ExponentialKernel(Kernel):
         return (step * (y + step)).sum(-1), step
 
     def exponent_rate(self) -> Tensor:
-        return torch.ones((), dtype=torch.float64)
+        return torch.ones((), dtype=torch.float64, device="cpu")
 
     def anchored(self, x1: Tensor, x2: Tensor) -> Tensor:
         return inner(x1, x2).expm1()

@@ -108,7 +108,7 @@ def save(path: Path, trace: Trace, tensors: Sequence[Tensor]) -> None:
         return
     file = io.BytesIO()
     try:
-        numberless = trace.recipe._replace(values=torch.empty(0, dtype=torch.float64))
+        numberless = trace.recipe._replace(values=torch.empty(0, dtype=torch.float64, device="cpu"))
         _TraceWriter(file, places, numberless).dump(tuple(trace._replace(recipe=numberless)))
         content = zlib.compress(file.getvalue(), level=1)  # 100 kilobytes to 15
         # Under a name of its own first: another process may be writing the same.
@@ -186,7 +186,7 @@ class _TraceReader(pickle.Unpickler):
         if kind == "given":
             return self._given[value]
         if kind == "made":  # stands for what the operation will make: its identity alone matters
-            return self._made.setdefault(value, torch.empty(0, dtype=torch.float64))
+            return self._made.setdefault(value, torch.empty(0, dtype=torch.float64, device="cpu"))
         return torch.from_numpy(value)
 
 

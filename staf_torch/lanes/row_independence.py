@@ -97,7 +97,7 @@ def generators() -> Callable[[], None]:
 
 def _farthest(given: Given) -> int:
     """The row whose inputs differ most from those of the first."""
-    distance = torch.zeros(given.rows, dtype=torch.float64)
+    distance = torch.zeros(given.rows, dtype=torch.float64, device="cpu")
     for leaf in (*given.carry, *given.now, *given.row):
         if isinstance(leaf, Tensor) and leaf.numel():
             at = leaf[:, 0] if any(leaf is other for other in given.now) else leaf

@@ -25,7 +25,7 @@ def number(name: str, value: float) -> Tensor:
 
     Two names never share one: a text would then know that their numbers are equal.
     """
-    return torch.tensor(value, dtype=torch.float64)
+    return torch.tensor(value, dtype=torch.float64, device="cpu")
 
 
 class _KeptModel(NamedTuple):

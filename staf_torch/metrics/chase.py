@@ -106,7 +106,7 @@ class ChaseMetrics:
         batch, length, _ = result.state.shape
         firsts = self._firsts(rows.first, batch)  # of the window, of each row
         early, skip = (min(max(int(k) - rows.time, 0), length) for k in (firsts.max(), firsts.min()))
-        index = torch.arange(rows.time, rows.time + length)
+        index = torch.arange(rows.time, rows.time + length, device="cpu")
         settled = (index >= firsts.unsqueeze(-1)).to(result.state.device)  # (B, C)
         rows.time += length
         rows.diverged = result.diverged
@@ -159,10 +159,14 @@ class ChaseMetrics:
     def _firsts(self, start: int, batch: int) -> Tensor:
         """The index of the first settled time of each of the rows from ``start`` on: (B,)."""
         if self._members is None:
-            return torch.full((batch,), self._whole.first, dtype=torch.int64)
-        ends = torch.tensor([member.rows for member in self._members], dtype=torch.int64).cumsum(0)
-        of_row = torch.searchsorted(ends, torch.arange(start, start + batch), right=True)
-        return torch.tensor([member.first for member in self._members], dtype=torch.int64)[of_row]
+            return torch.full((batch,), self._whole.first, dtype=torch.int64, device="cpu")
+        ends = torch.tensor(
+            [member.rows for member in self._members], dtype=torch.int64, device="cpu"
+        ).cumsum(0)
+        of_row = torch.searchsorted(ends, torch.arange(start, start + batch, device="cpu"), right=True)
+        return torch.tensor([member.first for member in self._members], dtype=torch.int64, device="cpu")[
+            of_row
+        ]
 
     def _gathered(self) -> _RowRecord:
         """All rows as one."""
@@ -202,7 +206,7 @@ class _RowRecord:
         self.worst: dict[str, Tensor] = {}  # name -> (B,)
         self.counts: dict[str, Tensor] = {}  # name -> (B,) int64; times until the excess settles among them
         self.early: list[Tensor] = []  # excess before the window, -inf in it, (B, C) a piece
-        self.diverged = torch.zeros(0, dtype=torch.bool)
+        self.diverged = torch.zeros(0, dtype=torch.bool, device="cpu")
 
     def count(self, name: str, happened: Tensor) -> None:
         """Add the times of a piece (B, C) at which something happened."""

@@ -72,7 +72,7 @@ def periods_of(output: Callable[[Tensor], Tensor], dim: int, periodic: Sequence[
         periodic: the coordinates that are angles in rad.
     """
     generator = torch.Generator().manual_seed(0)
-    x = torch.randn(_PROBES, dim, dtype=torch.float64, generator=generator)
+    x = torch.randn(_PROBES, dim, dtype=torch.float64, generator=generator, device="cpu")
     with torch.no_grad():
         seen = output(x)
         periods = [0.0] * seen.shape[-1]

@@ -14,7 +14,7 @@ _LOW, _FREE, _HIGH = -1, 0, 1
 def faces(count: int) -> Tensor:
     """Return which unknowns are at a bound, for every face of a box: (3^m, m) of -1, 0 (free) and 1."""
     cases = itertools.product((_FREE, _LOW, _HIGH), repeat=count)
-    return torch.tensor(list(cases), dtype=torch.int64).reshape(-1, count)
+    return torch.tensor(list(cases), dtype=torch.int64, device="cpu").reshape(-1, count)
 
 
 def face_inverses(curvature: Tensor) -> Tensor:

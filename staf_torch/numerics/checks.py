@@ -49,7 +49,11 @@ def real(call: str, name: str, value: object) -> float:
 def positive(call: str, name: str, value: object) -> Tensor:
     """A positive number or tensor of them, as a floating-point tensor (float64 from a number)."""
     checked = number(call, name, value)
-    tensor = torch.as_tensor(checked, dtype=None if isinstance(checked, Tensor) else torch.float64)
+    tensor = torch.as_tensor(
+        checked,
+        dtype=None if isinstance(checked, Tensor) else torch.float64,
+        device=getattr(checked, "device", "cpu"),
+    )
     if not tensor.is_meta and not bool((tensor > 0).all()):
         raise fail(call, name, "must be positive", value)
     return tensor
@@ -58,7 +62,11 @@ def positive(call: str, name: str, value: object) -> Tensor:
 def non_negative(call: str, name: str, value: object) -> Tensor:
     """Like `positive`, zero allowed."""
     checked = number(call, name, value)
-    tensor = torch.as_tensor(checked, dtype=None if isinstance(checked, Tensor) else torch.float64)
+    tensor = torch.as_tensor(
+        checked,
+        dtype=None if isinstance(checked, Tensor) else torch.float64,
+        device=getattr(checked, "device", "cpu"),
+    )
     if not tensor.is_meta and not bool((tensor >= 0).all()):
         raise fail(call, name, "must not be negative", value)
     return tensor
@@ -126,7 +134,7 @@ def one_or_each(call: str, name: str, value: object, count: int) -> Tensor:
     numbers = vector(call, name, given)
     if len(numbers) != count:
         raise fail(call, name, f"must be one number or a list of {count}", value)
-    return torch.tensor(numbers, dtype=torch.float64)
+    return torch.tensor(numbers, dtype=torch.float64, device="cpu")
 
 
 def trailing(call: str, name: str, value: Tensor, dims: int, last: int | None = None) -> Tensor:

@@ -85,25 +85,27 @@ def exponential_step(
     before = torch.stack((zero, 0.5 * h * half_one, h * half_two, 2 * h * two))
     middle = h * (2 * two - 4 * three)
     weight = torch.stack((h * (one - 3 * two + 4 * three), middle, middle, h * (4 * three - two)))
-    starts = torch.tensor([[1.0], [0.0], [0.0], [0.0]], dtype=torch.float64)
+    starts = torch.tensor([[1.0], [0.0], [0.0], [0.0]], dtype=torch.float64, device="cpu")
     paid = None
     if curvature is not None:
         # (moved, N, N', N'', d at the start): moved' = A moved + N.
-        whole = torch.zeros(5 * n, 5 * n, dtype=torch.float64)
+        whole = torch.zeros(5 * n, 5 * n, dtype=torch.float64, device="cpu")
         whole[:n, :n] = a
         for k in range(3):
-            whole[k * n : (k + 1) * n, (k + 1) * n : (k + 2) * n] = torch.eye(n, dtype=torch.float64)
-        both = torch.zeros(n, 5 * n, dtype=torch.float64)
-        both[:, :n] = both[:, 4 * n :] = torch.eye(n, dtype=torch.float64)
+            whole[k * n : (k + 1) * n, (k + 1) * n : (k + 2) * n] = torch.eye(
+                n, dtype=torch.float64, device="cpu"
+            )
+        both = torch.zeros(n, 5 * n, dtype=torch.float64, device="cpu")
+        both[:, :n] = both[:, 4 * n :] = torch.eye(n, dtype=torch.float64, device="cpu")
         rate = both.mT @ curvature.double() @ both
         _, integral = quadratic_integral(
-            whole - 0.5 * discount * torch.eye(5 * n, dtype=torch.float64), rate, h
+            whole - 0.5 * discount * torch.eye(5 * n, dtype=torch.float64, device="cpu"), rate, h
         )
         rows = (1.0, 0.0, 0.0), (-3 / h, 4 / h, -1 / h), (4 / h**2, -8 / h**2, 4 / h**2)
-        stages = torch.tensor(rows, dtype=torch.float64)
-        basis = torch.zeros(5, 4, dtype=torch.float64)
+        stages = torch.tensor(rows, dtype=torch.float64, device="cpu")
+        basis = torch.zeros(5, 4, dtype=torch.float64, device="cpu")
         basis[1:4, 1:], basis[4, 0] = stages, 1.0
-        turned = torch.kron(basis, torch.eye(n, dtype=torch.float64))
+        turned = torch.kron(basis, torch.eye(n, dtype=torch.float64, device="cpu"))
         paid = turned.mT @ integral @ turned
     return ExponentialStep(a, begun, before, weight, starts, paid)
 
@@ -111,10 +113,12 @@ def exponential_step(
 def _phi(a: Tensor, h: float) -> tuple[Tensor, Tensor, Tensor]:
     """phi_1, phi_2, phi_3 of h A, (n, n) each."""
     n = len(a)
-    whole = torch.zeros(4 * n, 4 * n, dtype=torch.float64)
+    whole = torch.zeros(4 * n, 4 * n, dtype=torch.float64, device="cpu")
     whole[:n, :n] = h * a
     for k in range(3):
-        whole[k * n : (k + 1) * n, (k + 1) * n : (k + 2) * n] = torch.eye(n, dtype=torch.float64)
+        whole[k * n : (k + 1) * n, (k + 1) * n : (k + 2) * n] = torch.eye(
+            n, dtype=torch.float64, device="cpu"
+        )
     found = exponential(whole)[:n]
     return found[:, n : 2 * n], found[:, 2 * n : 3 * n], found[:, 3 * n :]
 
@@ -209,13 +213,16 @@ def needed_steps(
         enough: error that is left as it is without more steps.
     """
     count = len(most)
-    factor, error = torch.ones(count, dtype=torch.int64), torch.full((count,), math.inf, dtype=torch.float64)
-    rows, last, times = torch.arange(count), error.clone(), 1
+    factor, error = (
+        torch.ones(count, dtype=torch.int64, device="cpu"),
+        torch.full((count,), math.inf, dtype=torch.float64, device="cpu"),
+    )
+    rows, last, times = torch.arange(count, device="cpu"), error.clone(), 1
     while len(rows):
         now = errors(rows, times).double().cpu()
         factor[rows], error[rows] = times, now
         pairs = zip(now.tolist(), last.tolist(), strict=True)
-        stalled = torch.tensor([stalls(one, before) for one, before in pairs], dtype=torch.bool)
+        stalled = torch.tensor([stalls(one, before) for one, before in pairs], dtype=torch.bool, device="cpu")
         further = (now > (enough if times == 1 else tolerance)) & ~stalled & (2 * times <= most[rows])
         rows, last, times = rows[further], now[further], 2 * times
     return StepsNeeded(factor, error)

@@ -17,7 +17,9 @@ def use_forward_mode() -> None:
     """Let torch load what its forward mode needs, without its warning about its own `torch.jit.script`."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*torch.jit.script")
-        torch.func.jvp(torch.sin, (torch.zeros(1).double(),), (torch.ones(1).double(),))
+        torch.func.jvp(
+            torch.sin, (torch.zeros(1, device="cpu").double(),), (torch.ones(1, device="cpu").double(),)
+        )
 
 
 def jacobian(function: Callable[[Tensor], Tensor], y: Tensor) -> Tensor:

@@ -77,7 +77,9 @@ def unstabilisable_mode(a: Tensor, b: Tensor, discrete: bool = False) -> complex
     for eigenvalue in torch.linalg.eigvals(a).tolist():
         if abs(eigenvalue) < 1 - 1e-9 if discrete else eigenvalue.real < -1e-9 * scale:
             continue
-        pencil = torch.cat((a - eigenvalue * torch.eye(size, dtype=torch.complex128), b + 0j), dim=1)
+        pencil = torch.cat(
+            (a - eigenvalue * torch.eye(size, dtype=torch.complex128, device="cpu"), b + 0j), dim=1
+        )
         if float(torch.linalg.svdvals(pencil)[size - 1]) < 1e-9 * scale:
             return complex(eigenvalue)
     return None

@@ -208,8 +208,12 @@ def _check_independent(names: list[str], parameters: list[Tensor], slopes: Seque
         if slope is None or not slope.requires_grad:
             continue
         generator = torch.Generator().manual_seed(0)
-        v = torch.randn(parameter.shape, dtype=torch.float64, generator=generator).to(parameter)
-        rows = torch.linspace(1, 2, v[..., 0].numel(), dtype=torch.float64).to(v).view_as(v[..., :1])
+        v = torch.randn(parameter.shape, dtype=torch.float64, generator=generator, device="cpu").to(parameter)
+        rows = (
+            torch.linspace(1, 2, v[..., 0].numel(), dtype=torch.float64, device="cpu")
+            .to(v)
+            .view_as(v[..., :1])
+        )
         products = _products(slope, parameters, v)
         own = products[[p is parameter for p in parameters].index(True)]
         size, rounding = float(own.norm()), torch.finfo(v.dtype).eps ** 0.5

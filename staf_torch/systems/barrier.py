@@ -217,4 +217,4 @@ def wall_numbers(call: str, name: str, given: Wall, none: float, size: int) -> T
         raise fail(call, name, "must be numbers or None", given)
     if any(math.isnan(one) or one == -none for one in walls):
         raise fail(call, name, f"must be finite or {none}", given)
-    return torch.tensor(walls, dtype=torch.float64)
+    return torch.tensor(walls, dtype=torch.float64, device="cpu")

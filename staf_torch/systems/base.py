@@ -90,11 +90,11 @@ class Plant(nn.Module, abc.ABC):
 
     def equilibrium(self) -> Tensor:
         """The state at which the plant rests under `resting_input`, (n,): zeros unless it says else."""
-        return torch.zeros(self._size(), dtype=torch.float64)
+        return torch.zeros(self._size(), dtype=torch.float64, device="cpu")
 
     def resting_input(self) -> Tensor:
         """The input that holds the plant at its equilibrium, (m,): zeros unless it says else."""
-        return torch.zeros(self.inputs, dtype=torch.float64)
+        return torch.zeros(self.inputs, dtype=torch.float64, device="cpu")
 
     @abc.abstractmethod
     def motion(self, x: Tensor, u: Tensor) -> Tensor:

@@ -137,7 +137,7 @@ class BlackBox:
 
     def _known(self, slopes: Slopes, x: Tensor, u: Tensor) -> Linearisation:
         found = slopes(x.detach().cpu().numpy(), u.detach().cpu().numpy())
-        a, b = (torch.as_tensor(np.asarray(part, dtype=np.float64)) for part in found)
+        a, b = (torch.as_tensor(np.asarray(part, dtype=np.float64), device="cpu") for part in found)
         if a.shape != (len(x), len(x)) or b.shape != (len(x), len(u)):
             raise ValueError(
                 f"the `slopes` of `{self._call}` must have the shapes {(len(x), len(x))} and "
@@ -165,11 +165,13 @@ class BlackBox:
             found: Tensor = self._function(x.detach(), u.detach())
             return found
         after = self._function(x.detach().cpu().numpy(), u.detach().cpu().numpy())
-        return torch.as_tensor(np.asarray(after, dtype=np.float64)).to(x)
+        return torch.as_tensor(np.asarray(after, dtype=np.float64), device="cpu").to(x)
 
     def _try(self, x: Tensor, u: Tensor) -> None:
         generator = torch.Generator().manual_seed(0)
-        away = 0.1 * torch.randn(_PROBES, len(x) + 2 * len(u), dtype=torch.float64, generator=generator)
+        away = 0.1 * torch.randn(
+            _PROBES, len(x) + 2 * len(u), dtype=torch.float64, generator=generator, device="cpu"
+        )
         states, inputs = x + away[:, : len(x)], u + away[:, len(x) : len(x) + len(u)]
 
         def pushed(size: float) -> tuple[tuple[Tensor, Tensor], Tensor]:

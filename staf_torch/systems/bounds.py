@@ -77,7 +77,7 @@ def _limit(name: str, given: Limit, none: float, inputs: int) -> Tensor:
         raise fail("Bounds", name, "must be a number or one an input", given)
     numbers = numbers_of("Bounds", name, given)
     try:
-        limit = torch.as_tensor(numbers, dtype=torch.float64)
+        limit = torch.as_tensor(numbers, dtype=torch.float64, device=getattr(numbers, "device", "cpu"))
     except (TypeError, ValueError) as error:
         raise fail("Bounds", name, "must be a number or one an input", given) from error
     if limit.dim() == 0:

@@ -111,8 +111,12 @@ def find_equilibrium(
         ValueError: if there is none near the guess; the message says which coordinate keeps moving.
     """
     refuse_gradient("find_equilibrium", plant=plant, x=x, u=u)
-    x = torch.as_tensor(x, dtype=torch.float64)
-    u = plant.resting_input() if u is None else torch.as_tensor(u, dtype=torch.float64)
+    x = torch.as_tensor(x, dtype=torch.float64, device=getattr(x, "device", "cpu"))
+    u = (
+        plant.resting_input()
+        if u is None
+        else torch.as_tensor(u, dtype=torch.float64, device=getattr(u, "device", "cpu"))
+    )
     held = resting_input_at(plant, x, u)
     if bool(torch.isfinite(held).all()) and _rests(plant, x, held):
         return Equilibrium(x, held)

@@ -64,7 +64,7 @@ def trajectory(
     program, none, x = _stepped(system, dt, 1, total, len(x0)), torch.full_like(x0[..., 0], torch.nan), x0
     for start in range(0, total, size):
         stop = min(start + size, total)
-        time = torch.arange(start, stop, dtype=torch.float64) * dt
+        time = torch.arange(start, stop, dtype=torch.float64, device="cpu") * dt
         exact = flow(x0, time) if flow is not None else None
         if exact is not None:
             yield exact
@@ -143,7 +143,7 @@ def _refined(
         wrong = torch.where(known[some], (now - better).abs().amax(-1), 0.0).amax(1)
         return (wrong / torch.where(known[some], size, 0.0).amax(1)).nan_to_num(math.inf, math.inf)
 
-    most = torch.full((len(rows),), MOST, dtype=torch.int64)
+    most = torch.full((len(rows),), MOST, dtype=torch.int64, device=rows.device)
     found = needed_steps(errors, most, TOLERANCE, GRACE * TOLERANCE)
     for factor in found.factor.unique().tolist():
         chosen = rows[(found.factor == factor).to(rows.device)]

@@ -75,4 +75,6 @@ def _rows(name: str, matrix: object, rule: str) -> Sequence[Sequence[float]]:
 
 
 def _stack(name: str, rows: Sequence[Sequence[float]], length: int) -> Tensor:
-    return torch.tensor([vector("Linear", name, row, length) for row in rows], dtype=torch.float64)
+    return torch.tensor(
+        [vector("Linear", name, row, length) for row in rows], dtype=torch.float64, device="cpu"
+    )

@@ -24,7 +24,11 @@ def _torch(value: Any) -> Any:
     if isinstance(value, TensorArray):
         return value.tensor
     if isinstance(value, np.ndarray):
-        return torch.as_tensor(value, dtype=torch.bool if value.dtype == bool else torch.float64)
+        return torch.as_tensor(
+            value,
+            dtype=torch.bool if value.dtype == bool else torch.float64,
+            device=getattr(value, "device", "cpu"),
+        )
     return type(value)(map(_torch, value)) if isinstance(value, list | tuple) else value
 
 
@@ -48,7 +52,7 @@ def _clip(x: Tensor, low: Any = None, high: Any = None, **other: Any) -> Tensor:
 
 
 def _wide(value: Any) -> Tensor:
-    return torch.as_tensor(value, dtype=torch.float64)
+    return torch.as_tensor(value, dtype=torch.float64, device=getattr(value, "device", "cpu"))
 
 
 def _joined(join: Function) -> Function:
@@ -185,7 +189,7 @@ def agrees(function: Function, x: Tensor, u: Tensor) -> bool:
     try:
         with torch.no_grad():
             found = InTorch(function)(x, u)
-        wanted = torch.as_tensor(np.asarray(function(x.numpy(), u.numpy()), dtype=np.float64))
+        wanted = torch.as_tensor(np.asarray(function(x.numpy(), u.numpy()), dtype=np.float64), device="cpu")
     except Exception:  # it is a black box then
         return False
     scale = 1 + wanted.abs()

@@ -38,7 +38,7 @@ class TwoStateChain(ControlAffineSystem):
         super().__init__()
         given = list(numbers_of("TwoStateChain", "theta", theta))
         numbers = vector("TwoStateChain", "theta", given, 4)
-        self.theta = hold(self, "theta", torch.tensor(numbers, dtype=torch.float64))
+        self.theta = hold(self, "theta", torch.tensor(numbers, dtype=torch.float64, device="cpu"))
 
     def drift(self, x: Tensor) -> Tensor:
         a, b, c, d = self.theta.to(x).unbind(-1)

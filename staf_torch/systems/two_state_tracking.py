@@ -44,7 +44,11 @@ class TwoStateTracking(ControlAffineSystem):
 
     def __init__(self, theta: Tensor | list[list[float]] | None = None) -> None:
         super().__init__()
-        chosen = true_parameters() if theta is None else torch.as_tensor(theta)
+        chosen = (
+            true_parameters()
+            if theta is None
+            else torch.as_tensor(theta, device=getattr(theta, "device", "cpu"))
+        )
         number("TwoStateTracking", "theta", chosen)
         if chosen.shape[-2:] != (3, 2):
             raise fail("TwoStateTracking", "theta", "must be (..., 3, 2)", tuple(chosen.shape))
@@ -70,7 +74,7 @@ class TwoStateTracking(ControlAffineSystem):
 
 def true_parameters() -> Tensor:
     """theta of the two-state plant's drift, (3, 2), float64."""
-    return torch.tensor(_TRUE, dtype=torch.float64)
+    return torch.tensor(_TRUE, dtype=torch.float64, device="cpu")
 
 
 def regressor(x: Tensor) -> Tensor:

@@ -192,7 +192,10 @@ class RatePlant(FunctionPlant):
 
 
 def _guess(call: str, given: Guess, dim: int, inputs: int) -> tuple[Tensor, Tensor]:
-    x, u = torch.zeros(dim, dtype=torch.float64), torch.zeros(inputs, dtype=torch.float64)
+    x, u = (
+        torch.zeros(dim, dtype=torch.float64, device="cpu"),
+        torch.zeros(inputs, dtype=torch.float64, device="cpu"),
+    )
     if given is None:
         return x, u
     pair = isinstance(given, tuple) and len(given) == 2 and isinstance(given[0], Sequence | Tensor)
@@ -203,5 +206,5 @@ def _guess(call: str, given: Guess, dim: int, inputs: int) -> tuple[Tensor, Tens
         if len(numbers) != size:
             rule = f"must be {dim} numbers, or those and {inputs} of the input"
             raise fail(call, "equilibrium", rule, given)
-        points.append(torch.tensor(numbers, dtype=torch.float64))
+        points.append(torch.tensor(numbers, dtype=torch.float64, device="cpu"))
     return points[0], points[1]

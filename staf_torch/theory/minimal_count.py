@@ -107,7 +107,7 @@ def minimal_count(
     families = standard_layouts(states.shape[-1]) if layouts is None else layouts
     ordered = sorted(_checked(call, families, states.shape[-1]), key=len)
     errors = layout_errors(target, kernel, states, radius, ordered)
-    counts = torch.tensor([len(layout) for layout in ordered], dtype=torch.int64)
+    counts = torch.tensor([len(layout) for layout in ordered], dtype=torch.int64, device="cpu")
     good = errors <= allowed  # (L, ...)
     enough = good.reshape(len(counts), -1).all(-1)
     if not bool(enough.any()):

@@ -96,7 +96,9 @@ def drift_constants(basis: StaFBasis, target: Target, states: Tensor, velocities
     # With L L' = e^{-g} K, in orthonormal coordinates L'v: K^-1 K' is L^-1 gram' L^-T + g', and
     # w' = e^{-g} (gram^-1 (V' - gram' w~) - g' w~), w~ = e^g w = gram^-1 V.
     inner = lower(lower(rates.gram_rate).mT)
-    inner = (inner + inner.mT) / 2 + gain_rate[..., None, None] * torch.eye(basis.count).to(inner)
+    inner = (inner + inner.mT) / 2 + gain_rate[..., None, None] * torch.eye(basis.count, device="cpu").to(
+        inner
+    )
     value = lower(rates.values.unsqueeze(-1))
     speed = (lower(rates.values_rate.unsqueeze(-1)) - inner @ value).squeeze(-1).norm(dim=-1)
     growth = torch.linalg.eigvalsh(inner)[..., -1] / 2
@@ -218,7 +220,7 @@ def steps_for_bound(
 def _contraction(call: str, constants: DriftConstants, law: UpdateLaw, inner_steps: int) -> float:
     """q = delta(kappa)^{its/2}."""
     integer(call, "inner_steps", inner_steps, least=1)
-    rate = law.contraction(torch.tensor(constants.condition_number, dtype=torch.float64))
+    rate = law.contraction(torch.tensor(constants.condition_number, dtype=torch.float64, device="cpu"))
     if rate is None:
         raise fail(call, "law", "must have a known contraction an iteration", type(law).__name__)
     return math.pow(float(rate), inner_steps / 2)
@@ -322,7 +324,10 @@ def _ascend(function: Callable[[Tensor], Tensor], like: Tensor, radius: Tensor) 
     """max of a function (..., M) -> (...) over |a| <= radius at each state, ``like`` being (..., M), by
     normalised gradient ascent on the sphere from all starts side by side."""
     generator = torch.Generator().manual_seed(0)
-    drawn = [torch.randn(like.shape[-1], generator=generator, dtype=torch.float64) for _ in range(_STARTS)]
+    drawn = [
+        torch.randn(like.shape[-1], generator=generator, dtype=torch.float64, device="cpu")
+        for _ in range(_STARTS)
+    ]
     starts = torch.stack(drawn).to(like)
     starts = radius * starts / starts.norm(dim=-1, keepdim=True)
     a = starts.view(_STARTS, *[1] * (like.dim() - 1), -1).expand(-1, *like.shape)

@@ -43,7 +43,7 @@ def ball_grid(dim: int, shells: int, directions: int) -> Tensor:
     """
     for name, value in (("dim", dim), ("shells", shells), ("directions", directions)):
         integer("ball_grid", name, value, least=1)
-    radii = torch.cos(torch.arange(shells, dtype=torch.float64) * (math.pi / (2 * shells)))
+    radii = torch.cos(torch.arange(shells, dtype=torch.float64, device="cpu") * (math.pi / (2 * shells)))
     points = (radii[:, None, None] * _directions(dim, shells, directions)).reshape(-1, dim)
     return torch.cat((points.new_zeros(1, dim), points))
 
@@ -51,10 +51,10 @@ def ball_grid(dim: int, shells: int, directions: int) -> Tensor:
 def _directions(dim: int, shells: int, directions: int) -> Tensor:
     """Unit vectors, (shells or 1, directions, dim)."""
     if dim == 1:
-        return torch.tensor([[[1.0], [-1.0]]], dtype=torch.float64)
+        return torch.tensor([[[1.0], [-1.0]]], dtype=torch.float64, device="cpu")
     if dim == 2:
-        turned = 0.5 * (torch.arange(shells, dtype=torch.float64) % 2)
-        steps = torch.arange(directions, dtype=torch.float64) + turned[:, None]
+        turned = 0.5 * (torch.arange(shells, dtype=torch.float64, device="cpu") % 2)
+        steps = torch.arange(directions, dtype=torch.float64, device="cpu") + turned[:, None]
         angle = steps * (2 * math.pi / directions)
         return torch.stack((angle.cos(), angle.sin()), dim=-1)
     cloud = probe_points(shells * directions + 1, dim)[1:]
@@ -121,7 +121,7 @@ def disc(
     extent = positive_real("disc", "radius", radius)
     integer("disc", "dim", dim, least=1)
     middle = [0.0] * dim if center is None else vector("disc", "center", center, dim)
-    offset = torch.tensor(middle, dtype=torch.float64)
+    offset = torch.tensor(middle, dtype=torch.float64, device="cpu")
     return offset + extent * probe_points(integer("disc", "count", count, least=2), dim)
 
 

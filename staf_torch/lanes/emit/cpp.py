@@ -58,7 +58,7 @@ class Text(NamedTuple):
 
     def numbers(self, parameters: Tensor, real: torch.dtype) -> Tensor:
         """The table with these parameters, float64, in the program's dtype."""
-        table = torch.tensor(self.table or [0.0], dtype=torch.float64)
+        table = torch.tensor(self.table or [0.0], dtype=torch.float64, device="cpu")
         if self.parameters:
             places, numbers = zip(*self.parameters, strict=True)
             table[list(places)] = parameters[list(numbers)]

@@ -154,7 +154,7 @@ class Captured:
         found = {id(t): t for t in kept if id(t) not in made and not self._made_inside(t)}
         numbers = [t for t in found.values() if t.is_floating_point()]
         if not self._repeats:  # memory was written to: once more would write twice
-            numbers.append(torch.empty(0, dtype=torch.float64))
+            numbers.append(torch.empty(0, dtype=torch.float64, device="cpu"))
         return Recipe(_joined(self._values), operations, self._reads, numbers, self._checks)
 
     def _made_inside(self, tensor: Tensor) -> bool:
@@ -220,7 +220,7 @@ def _read(tensor: Tensor, at: np.ndarray[Any, Any]) -> Tensor:
 
 
 def _joined(parts: Sequence[Tensor]) -> Tensor:
-    return torch.cat(list(parts)) if parts else torch.zeros(0, dtype=torch.float64)
+    return torch.cat(list(parts)) if parts else torch.zeros(0, dtype=torch.float64, device="cpu")
 
 
 def _address(tensor: Tensor) -> int:

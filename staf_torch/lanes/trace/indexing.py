@@ -71,7 +71,9 @@ def _accumulated(t: Tracer, out: Tensor, a: Tensor, index: Sequence[Tensor | Non
         reason = "`aten.index_put` at an index that the row computes has no scalar form here"
         raise NotLoweredError(reason, "scatter_add")
     kind = t.kind(out.dtype)
-    places = torch.arange(a.numel()).reshape(a.shape)[tuple(slice(None) if i is None else i for i in index)]
+    places = torch.arange(a.numel(), device="cpu").reshape(a.shape)[
+        tuple(slice(None) if i is None else i for i in index)
+    ]
     nodes = np.broadcast_to(t.nodes(a, kind), a.shape).reshape(-1).copy()
     added = np.broadcast_to(t.nodes(source, kind), tuple(places.shape)).reshape(-1)
     for place, node in zip(places.reshape(-1).tolist(), added, strict=True):
@@ -193,7 +195,9 @@ def _put(
 ) -> Tensor:
     at = index.movedim(dim, 0)
     values = (
-        source.movedim(dim, 0) if isinstance(source, Tensor) and source.dim() else torch.as_tensor(source)
+        source.movedim(dim, 0)
+        if isinstance(source, Tensor) and source.dim()
+        else torch.as_tensor(source, device=getattr(source, "device", "cpu"))
     )
     inner = tuple(slice(size) for size in at.shape[1:])
     values = (
