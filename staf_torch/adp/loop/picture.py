@@ -73,6 +73,8 @@ class LoopAbout:
 
 def summary(result: LoopResult) -> str:
     """Return five lines: what ran, states, inputs, costs, how it ended."""
+    parts = {name: getattr(result, name).detach() for name in ("state", "control", "running_cost")}
+    result = dataclasses.replace(result, **parts)
     about = result.about
     rows, n, m = len(result.state), result.state.shape[-1], result.control.shape[-1]
     who = "" if about is None else f"{about.plant} with {about.controller}, "

@@ -276,8 +276,8 @@ class SafetyFilter(Controller):
             in which the control was another than the wanted one within the bounds; ``astray``, the rows in
             which the policy was followed ahead, as braking along the edge drives the plant away.
         """
-        steps, least, most, acted, astray = (result[name][:, -1] for name in Watched._fields[1:])
-        last = self.margins(result.state[:, -1], steps * self.hold).amin(-1)
+        steps, least, most, acted, astray = (result[name][:, -1].detach() for name in Watched._fields[1:])
+        last = self.margins(result.state[:, -1].detach(), steps * self.hold).amin(-1).detach()
         least = torch.minimum(least, last)
         return {
             "minimum_margin": float(least.min()),
