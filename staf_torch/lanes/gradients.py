@@ -130,7 +130,7 @@ class _Unserved(torch.autograd.Function):
     """The same numbers, of which no derivative is known."""
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor, wanted: Tensor, call: str) -> Tensor:  # type: ignore[override]
+    def forward(ctx: Any, x: Tensor, wanted: Tensor, call: str) -> Tensor:
         ctx.call = call
         return x.clone()
 

@@ -29,8 +29,8 @@ def opaque(function: Callable[_P, _R]) -> Callable[_P, _R]:
         finally:
             set_frames(before)
 
-    _skipped(alone.__code__)
     marked: Any = alone
+    _skipped(marked.__code__)
     marked._torchdynamo_disable, marked._torchdynamo_disable_recursive = True, True
     marked._torchdynamo_disable_msg = "it compiles itself"
     return alone
