@@ -47,7 +47,9 @@ class Reach(NamedTuple):
 def drawn(cost: Cost, width: Tensor, count: int, seed: int) -> Tensor:
     """States drawn uniformly from the box of half widths (n,) around the set-point, (count, n)."""
     generator = torch.Generator().manual_seed(seed)
-    away = width * (2 * torch.rand(count, cost.dim, dtype=torch.float64, generator=generator) - 1)
+    away = width * (
+        2 * torch.rand(count, cost.dim, dtype=torch.float64, generator=generator, device="cpu") - 1
+    )
     return away if cost.target is None else away + cost.target
 
 
@@ -167,7 +169,7 @@ def sampled_problem(plant: Plant, cost: Cost, period: float, x: Tensor) -> Sampl
     """
     if isinstance(plant, FunctionPlant):
         levels = Bounds(-1.0, 1.0, cost.inputs) if cost.bounds is None else cost.bounds
-        at = torch.linspace(0, 1, len(x), dtype=torch.float64).unsqueeze(1)
+        at = torch.linspace(0, 1, len(x), dtype=torch.float64, device=x.device).unsqueeze(1)
         low, high = levels.low.clamp(min=-1e3), levels.high.clamp(max=1e3)
         plant = plant.in_torch(x, low + at * (high - low)) or plant
     if not plant.traceable:

@@ -120,7 +120,7 @@ class ConsiderFilter:
         seen, r = (~missing).to(y), torch.diag(variance)
         whole = (own + shown) * seen.unsqueeze(-2)  # of the measured states, (..., n, n)
         gain = product(whole, torch.linalg.inv_ex(whole * seen.unsqueeze(-1) + r)[0])
-        kept = torch.eye(y.shape[-1]).to(y) - gain
+        kept = torch.eye(y.shape[-1], device=y.device).to(y) - gain
         left = self.model.difference(torch.where(missing, mean, y), mean)
         mean = mean + (gain * left.unsqueeze(-2)).sum(-1)
         own = product(product(kept, own), kept.mT) + product(product(gain, r), gain.mT)

@@ -72,7 +72,7 @@ class LeastSquares:
     ) -> None:
         first = vector("LeastSquares", "theta", theta)
         sizes = one_or_each("LeastSquares", "deviation", deviation, len(first))
-        self.first = torch.tensor(first, dtype=torch.float64)
+        self.first = torch.tensor(first, dtype=torch.float64, device="cpu")
         self.prior = torch.diag(positive("LeastSquares", "deviation", sizes).square())
         self.floor = positive_real("LeastSquares", "floor", floor)
         non_negative("LeastSquares", "forgetting", forgetting)

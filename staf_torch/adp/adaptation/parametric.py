@@ -85,7 +85,7 @@ class ParametricPlant(ControlAffineSystem):
         self.rows = list(range(dim)) if rows is None else list(rows)
         if not self.rows or self.rows != sorted(set(self.rows) & set(range(dim))):
             raise fail("ParametricPlant", "rows", f"must be numbers of the {dim} states, in order", rows)
-        chosen = torch.as_tensor(theta, dtype=torch.float64)
+        chosen = torch.as_tensor(theta, dtype=torch.float64, device=getattr(theta, "device", "cpu"))
         number("ParametricPlant", "theta", chosen)
         if chosen.dim() == 0 or chosen.shape[-1] == 0:
             raise fail("ParametricPlant", "theta", "must be (..., p) with p at least 1", tuple(chosen.shape))
@@ -107,7 +107,7 @@ class ParametricPlant(ControlAffineSystem):
             lambda x, u: plant.drift(x),
             dim=plant._size(),
             inputs=plant.inputs,
-            theta=torch.ones(plant.inputs, dtype=torch.float64),
+            theta=torch.ones(plant.inputs, dtype=torch.float64, device="cpu"),
             periodic=plant.periodic,
             bounds=plant.bounds,
         )
@@ -198,7 +198,9 @@ class ParametricPlant(ControlAffineSystem):
         generator = torch.Generator().manual_seed(0)
         lead = self.theta.shape[:-1] or (4,)
         sizes = [(*lead, self.dim or 0), *((*lead, self.inputs),) * 2]
-        x, u, v = (torch.rand(size, dtype=torch.float64, generator=generator) - 0.5 for size in sizes)
+        x, u, v = (
+            torch.rand(size, dtype=torch.float64, generator=generator, device="cpu") - 0.5 for size in sizes
+        )
         for name, of, shape in (
             ("regressor", self.regressor, (*x.shape, self.parameters_count)),
             ("known", self.rest_of, tuple(x.shape)),

@@ -102,8 +102,12 @@ class RobustFilter(Controller):
     ) -> None:
         super().__init__()
         p, n = plant.parameters_count, plant._size()
-        self.low = torch.tensor(vector("RobustFilter", "theta_low", theta_low), dtype=torch.float64)
-        self.high = torch.tensor(vector("RobustFilter", "theta_high", theta_high), dtype=torch.float64)
+        self.low = torch.tensor(
+            vector("RobustFilter", "theta_low", theta_low), dtype=torch.float64, device="cpu"
+        )
+        self.high = torch.tensor(
+            vector("RobustFilter", "theta_high", theta_high), dtype=torch.float64, device="cpu"
+        )
         if self.low.shape != (p,) or self.high.shape != (p,) or not bool((self.low <= self.high).all()):
             rule = f"must be {p} numbers, none above that of theta_high"
             raise fail("RobustFilter", "theta_low", rule, theta_low)

@@ -93,7 +93,7 @@ class ConcurrentTracker(Controller):
         choice("ConcurrentTracker", "source", source, ("integral", "slope"))
         self.gains = []
         for name, value in (("feedback", feedback), ("gain", gain), ("rate", rate), ("length", length)):
-            given = torch.as_tensor(value, dtype=torch.float64)
+            given = torch.as_tensor(value, dtype=torch.float64, device=getattr(value, "device", "cpu"))
             if given.dim() > 1 or not bool((given > 0).all()):
                 raise fail("ConcurrentTracker", name, "must be positive, a number or one a row", value)
             self.gains.append(given)
@@ -104,7 +104,11 @@ class ConcurrentTracker(Controller):
         p, n = plant.parameters_count, plant._size()
         self.angles = tuple(index % n for index in plant.periodic if index % n < plant.inputs)
         self.stack = HistoryStack(len(plant.rows), p, size)
-        self.first = torch.zeros(p).double() if first is None else torch.tensor(first, dtype=torch.float64)
+        self.first = (
+            torch.zeros(p, device="cpu").double()
+            if first is None
+            else torch.tensor(first, dtype=torch.float64, device="cpu")
+        )
 
     def init(self, x0: Tensor) -> Tracking:
         feedback, gain, rate, length = (g.to(x0).expand(len(x0)).clone() for g in self.gains)

@@ -157,12 +157,14 @@ def _weights(name: str, value: Initial, count: int) -> Tensor:
         return trailing("ActorCritic", name, value, dims=1, last=count)
     if isinstance(value, int | float):
         value = [value] * count
-    return torch.tensor(vector("ActorCritic", name, value, count), dtype=torch.float64)
+    return torch.tensor(vector("ActorCritic", name, value, count), dtype=torch.float64, device="cpu")
 
 
 def _check_points(extrapolation: Extrapolation, dim: int) -> None:
     """Refuse points of another space than the plant's, which would fail within the loop."""
-    x, uniform = (torch.zeros(1, *rows, dim, dtype=torch.float64) for rows in ((), (extrapolation.draws,)))
+    x, uniform = (
+        torch.zeros(1, *rows, dim, dtype=torch.float64, device="cpu") for rows in ((), (extrapolation.draws,))
+    )
     try:
         shape = tuple(extrapolation(x, uniform).shape)
     except RuntimeError as error:

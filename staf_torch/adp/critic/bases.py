@@ -51,7 +51,7 @@ class ValueBasis(nn.Module, abc.ABC):
     def weights_near_square(self) -> list[float]:
         """W with which V^ is nearest to y'y over [-1, 1]^n: a start that often stabilises."""
         generator = torch.Generator().manual_seed(0)
-        y = 2 * torch.rand(1000, self.dim, dtype=torch.float64, generator=generator) - 1
+        y = 2 * torch.rand(1000, self.dim, dtype=torch.float64, generator=generator, device="cpu") - 1
         square = y.square().sum(-1, keepdim=True)
         fitted: list[float] = torch.linalg.lstsq(self(y, y), square, driver="gelsd").solution[:, 0].tolist()
         return fitted
@@ -163,8 +163,8 @@ class QuadraticBasis(ValueBasis):
     def __init__(self, dim: int) -> None:
         super().__init__()
         self.dim = integer("QuadraticBasis", "dim", dim, least=1)
-        rows, columns = torch.triu_indices(dim, dim)
-        identity = torch.eye(dim, dtype=torch.float64)
+        rows, columns = torch.triu_indices(dim, dim, device="cpu")
+        identity = torch.eye(dim, dtype=torch.float64, device="cpu")
         self.register_buffer("left", identity[rows])  # (M, n)
         self.register_buffer("right", identity[columns])
         self.left: Tensor
@@ -220,8 +220,8 @@ class RBFGridBasis(ValueBasis):
         side = positive_real("RBFGridBasis", "half_width", half_width)
         spacing = 2 * side / (points - 1)
         self.width = spacing if width is None else positive_real("RBFGridBasis", "width", width)
-        line = torch.linspace(-side, side, points, dtype=torch.float64).tolist()
-        grid = torch.tensor(list(itertools.product(line, repeat=dim)), dtype=torch.float64)
+        line = torch.linspace(-side, side, points, dtype=torch.float64, device="cpu").tolist()
+        grid = torch.tensor(list(itertools.product(line, repeat=dim)), dtype=torch.float64, device="cpu")
         self.register_buffer("centers", grid)  # (M, n)
         self.anchor: Tensor
         self.register_buffer("anchor", (-0.5 * grid.square().sum(-1) / self.width**2).exp())

@@ -90,7 +90,7 @@ class RandomPoints(Extrapolation):
     ) -> None:
         super().__init__(half_width, centers, around=around)
         self.count = self.draws = integer("RandomPoints", "count", count, least=1)
-        self.register_buffer("weights", torch.full((count,), 1 / count, dtype=torch.float64))
+        self.register_buffer("weights", torch.full((count,), 1 / count, dtype=torch.float64, device="cpu"))
 
     def cube(self, uniform: Tensor) -> Tensor:
         return uniform
@@ -130,8 +130,12 @@ class QuadraturePoints(Extrapolation):
         integer("QuadraturePoints", "order", order, least=1)
         integer("QuadraturePoints", "dim", dim, least=1)
         nodes, masses = np.polynomial.legendre.leggauss(order)
-        grid = torch.tensor(list(itertools.product(nodes.tolist(), repeat=dim)), dtype=torch.float64)
-        products = torch.tensor(list(itertools.product(masses.tolist(), repeat=dim)), dtype=torch.float64)
+        grid = torch.tensor(
+            list(itertools.product(nodes.tolist(), repeat=dim)), dtype=torch.float64, device="cpu"
+        )
+        products = torch.tensor(
+            list(itertools.product(masses.tolist(), repeat=dim)), dtype=torch.float64, device="cpu"
+        )
         self.register_buffer("grid", grid)  # (N, n)
         self.register_buffer("weights", products.prod(-1) / 2**dim)
         self.grid: Tensor

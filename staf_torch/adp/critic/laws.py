@@ -69,7 +69,7 @@ class Gains:
             value = number("Gains", field.name, getattr(self, field.name))
             if isinstance(value, Tensor) and (value.dim() != 2 or value.shape[-1] != 1):
                 raise fail("Gains", field.name, "must be a number or of the shape (B, 1)", tuple(value.shape))
-            if bool((torch.as_tensor(value) < 0).any()):
+            if bool((torch.as_tensor(value, device=getattr(value, "device", "cpu")) < 0).any()):
                 raise fail("Gains", field.name, "must not be negative", value)
 
 

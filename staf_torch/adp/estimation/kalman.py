@@ -62,9 +62,9 @@ class KalmanFilter(abc.ABC):
             raise fail(name, "noise", "must be positive numbers, one an output", noise)
         self.model, self.output = model, output
         self._held: dict[float, Holding] = {}  # of every period
-        self.noise = torch.tensor(noise, dtype=torch.float64)
+        self.noise = torch.tensor(noise, dtype=torch.float64, device="cpu")
         self.process = non_negative(name, "process", one_or_each(name, "process", process, n))
-        seen = output(torch.zeros(1, n, dtype=torch.float64))
+        seen = output(torch.zeros(1, n, dtype=torch.float64, device="cpu"))
         if tuple(seen.shape) != (1, len(noise)):
             raise fail(name, "output", f"must map (1, {n}) to (1, {len(noise)})", tuple(seen.shape))
         q = len(noise)
@@ -267,7 +267,7 @@ class Observed(Controller):
         spread = positive("Observed", "deviation", one_or_each("Observed", "deviation", deviation, n))
         guess = filter.model.equilibrium()
         if mean is not None:
-            guess = torch.tensor(vector("Observed", "mean", mean, n), dtype=torch.float64)
+            guess = torch.tensor(vector("Observed", "mean", mean, n), dtype=torch.float64, device="cpu")
         self.controller, self.filter = controller, filter
         self.guess, self.deviation = guess, spread
         self.draws, self.period = controller.draws, controller.period

@@ -57,7 +57,7 @@ class Measured(Controller):
         if len(several) != dim or not all(s >= 0 for s in several):
             raise fail("Measured", "noise", f"must not be negative, one number or {dim}", noise)
         self.controller, self.dim, self.output = controller, dim, output
-        self.noise = torch.tensor(several, dtype=torch.float64)
+        self.noise = torch.tensor(several, dtype=torch.float64, device="cpu")
         # Normal numbers come in pairs: an odd number of outputs takes two points of the state's size.
         self._own = (1 + dim % 2) if any(s > 0 for s in several) else 0
         self.period = controller.period

@@ -46,7 +46,7 @@ def needed(holding: Holding, x: Tensor, u: Tensor, frozen: Tensor, most: int = M
 
 def _errors(holding: Holding, x: Tensor, u: Tensor, known: Tensor) -> Tensor:
     """Return the largest error of a row's holds, relative to its largest state and cost: (R,)."""
-    worst = torch.zeros(len(x), dtype=torch.float64)
+    worst = torch.zeros(len(x), dtype=torch.float64, device=x.device)
     for wrong, size in holding.doubled(x.flatten(0, 1), u.flatten(0, 1)):
         off, large = (torch.where(known, part.view(known.shape), 0.0) for part in (wrong, size))
         large = torch.where(torch.isfinite(large), large, 0.0).amax(1)

@@ -226,7 +226,7 @@ class LQR(nn.Module):
         if self.period is None:
             a, b = system.linearisation(still.target, still.target_input)
             name = type(system).__name__
-            rest = 0.5 * cost.discount * torch.eye(len(a), dtype=a.dtype)
+            rest = 0.5 * cost.discount * torch.eye(len(a), dtype=a.dtype, device=a.device)
             p = riccati(a - rest, b, still.state_curvature(), cost.r, name=name)
             k = cost.r_inverse @ b.to(p).mT @ p
         else:

@@ -146,7 +146,7 @@ def picture(result: LoopResult, rows: Sequence[int] | None, lqr: bool) -> LoopPi
         words = f"{about.plant}, {about.controller}"
     if len(chosen) < count:
         words += f", {len(chosen)} of {count} rows"
-    none = torch.full((inputs,), math.inf, dtype=torch.float64)
+    none = torch.full((inputs,), math.inf, dtype=torch.float64, device="cpu")
     return LoopPicture(
         *(words, result.time.cpu().numpy(), *_arrays(result, chosen)),
         *(units.of_states(dim)[: dim - clock], units.of_inputs(inputs)),

@@ -371,7 +371,7 @@ def _run(
     last, structure = flatten(record(loop, state, torch.full_like(pieces[-1][1][:, -1], torch.nan)))
     pieces.append([part.unsqueeze(1) for part in last])
     kept = unflatten(structure, (torch.cat(column, dim=1) for column in zip(*pieces, strict=True)))
-    time = torch.arange(0, steps + 1, every, dtype=torch.float64) * loop.dt
+    time = torch.arange(0, steps + 1, every, dtype=torch.float64, device="cpu") * loop.dt
     frozen_at = torch.where(state.alive, torch.inf, state.lived * loop.dt)
     result = LoopResult(time, kept.x, kept.u, kept.cost, kept.recorded, frozen_at, state.carried)
     return result, state
@@ -391,7 +391,7 @@ def _seeds(seed: int | Sequence[int], batch: int) -> Sequence[int]:
 def uniform_numbers(x0: Tensor, count: int, draws: int, generators: Sequence[torch.Generator]) -> Tensor:
     """The next ``count`` steps' uniform numbers of [-1, 1], (B, count, draws, n), one generator a row."""
     rows, dim = x0.shape
-    drawn = torch.empty(rows, count, draws, dim, dtype=torch.float64)
+    drawn = torch.empty(rows, count, draws, dim, dtype=torch.float64, device="cpu")
     for row, generator in zip(drawn.unbind(0), generators, strict=False):
         row.uniform_(-1.0, 1.0, generator=generator)
     return drawn.to(x0)

@@ -169,10 +169,10 @@ class BoxDDP:
         )
         best = cost.argsort(dim=0, stable=True)[:_STARTS]  # (S, B)
         count = len(best)
-        again = None if terminal is None else rows_of(terminal, torch.arange(b).repeat(count))
+        again = None if terminal is None else rows_of(terminal, torch.arange(b, device="cpu").repeat(count))
         found = self.solve(x0.repeat(count, 1), tried.to(x0)[best].flatten(0, 1), None, again)
         lowest = torch.where(torch.isfinite(found.cost), found.cost, torch.inf).view(count, b)
-        return rows_of(found, lowest.argmin(0) * b + torch.arange(b))
+        return rows_of(found, lowest.argmin(0) * b + torch.arange(b, device="cpu"))
 
     def ends(self, x0: Tensor) -> End:
         """V_T of plans from x0 (B, n): the value of the goal's linear feedback, or what the problem pays."""
@@ -279,7 +279,7 @@ class BoxDDP:
         if lengths.shape[1] == 1:
             return CostedTrajectories(states.squeeze(2), u.squeeze(2), cost.squeeze(1), parts.squeeze(2))
         best, at = cost.min(1)
-        rows = torch.arange(len(x0))
+        rows = torch.arange(len(x0), device=x0.device)
         return CostedTrajectories(states[rows, :, at], u[rows, :, at], best, parts[rows, :, at])
 
     def forward(
@@ -324,7 +324,9 @@ class BoxDDP:
             pull = cost_first[:, n:] + (first[..., n:] * after.gradient.unsqueeze(-1)).sum(-2)
             least, most = self.problem.reach()
             scale = torch.where(scale > 0, scale, (pull.abs() / (most - least)).mean(-1))
-        firmness = (mu * scale)[:, None, None] * torch.eye(control.shape[-1], dtype=control.dtype)
+        firmness = (mu * scale)[:, None, None] * torch.eye(
+            control.shape[-1], dtype=control.dtype, device=control.device
+        )
         definite = after.definite
 
         def minimum(slope: Tensor, cross: Tensor, hessian: Tensor) -> tuple[Tensor, Tensor]:

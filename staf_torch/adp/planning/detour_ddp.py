@@ -332,7 +332,12 @@ class DetourPlans(Controller):
     def _check_others(self) -> None:
         """Raise where the moved states or the inputs change how another state moves."""
         x, other = torch.randn(
-            2, _PROBES, self.cost.dim, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
+            2,
+            _PROBES,
+            self.cost.dim,
+            dtype=torch.float64,
+            generator=torch.Generator().manual_seed(0),
+            device="cpu",
         ).unbind(0)
         rest = self.plant.resting_input().double().expand(_PROBES, -1)
         other = torch.cat((other[:, : self.moved], x[:, self.moved :]), dim=-1)

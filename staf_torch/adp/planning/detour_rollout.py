@@ -101,7 +101,7 @@ class DetourRollout(Controller):
         check_traceable("DetourRollout", plant)
         self.policy, self.plant, self.terminal, self.cost = policy, plant, terminal, cost.around(plant)
         self.constraints = listed("DetourRollout", constraints)
-        along = torch.as_tensor(axes, dtype=torch.float64)
+        along = torch.as_tensor(axes, dtype=torch.float64, device=getattr(axes, "device", "cpu"))
         fits = along.dim() == 2 and along.shape[1] == cost.dim and 1 <= len(along) <= _AXES
         if not fits or not bool(torch.isfinite(along).all()):
             raise fail(
@@ -115,7 +115,7 @@ class DetourRollout(Controller):
         kept = one_or_each("DetourRollout", "margin", margin, len(self.constraints))
         non_negative("DetourRollout", "margin", kept)
         self.weight = positive_real("DetourRollout", "weight", weight)
-        large = torch.tensor(vector("DetourRollout", "sizes", list(sizes)), dtype=torch.float64)
+        large = torch.tensor(vector("DetourRollout", "sizes", list(sizes)), dtype=torch.float64, device="cpu")
         positive("DetourRollout", "sizes", large)
         long = [integer("DetourRollout", "lengths", length, least=1) for length in lengths]
         self.register_buffer("axes", along.clone())
@@ -169,7 +169,7 @@ class DetourRollout(Controller):
 
         total = each(total_of, tried, together=1).squeeze(-1)
         total = torch.where(torch.isfinite(total), total, torch.inf)
-        place = torch.arange(tried.shape[1], dtype=x.dtype)
+        place = torch.arange(tried.shape[1], dtype=x.dtype, device=x.device)
         first = torch.where(total == total.amin(-1, keepdim=True), place, float(len(place))).amin(-1)
         return torch.where((place == first.unsqueeze(-1)).unsqueeze(-1), tried, 0.0).sum(1)
 
@@ -207,7 +207,9 @@ class DetourRollout(Controller):
 def _detours(count: int, sizes: Tensor, lengths: Sequence[int]) -> Tensor:
     """Detours along all combinations of axes, of each size and length: (P, count + 1)."""
     ways = torch.tensor(
-        [way for way in itertools.product((0.0, 1.0, -1.0), repeat=count) if any(way)], dtype=torch.float64
+        [way for way in itertools.product((0.0, 1.0, -1.0), repeat=count) if any(way)],
+        dtype=torch.float64,
+        device="cpu",
     )
     ways = ways / ways.norm(dim=-1, keepdim=True)
     rows = [
@@ -219,6 +221,6 @@ def _detours(count: int, sizes: Tensor, lengths: Sequence[int]) -> Tensor:
 
 def _changes(count: int) -> Tensor:
     """Return no change, and small changes of a detour along each axis: (C, count + 1)."""
-    unit = torch.eye(count, count + 1, dtype=torch.float64)
+    unit = torch.eye(count, count + 1, dtype=torch.float64, device="cpu")
     steps = [sign * share * unit for share in _AROUND for sign in (1.0, -1.0)]
-    return torch.cat((torch.zeros(1, count + 1, dtype=torch.float64), *steps))
+    return torch.cat((torch.zeros(1, count + 1, dtype=torch.float64, device="cpu"), *steps))

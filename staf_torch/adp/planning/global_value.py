@@ -106,7 +106,7 @@ class GlobalValue(nn.Module):
             raise fail("GlobalValue", "region", "must be positive", width)
         self.lookahead = integer("GlobalValue", "lookahead", lookahead, least=1)
         self.spacing = positive_real("GlobalValue", "spacing", spacing)
-        self.register_buffer("region", torch.tensor(width, dtype=torch.float64))
+        self.register_buffer("region", torch.tensor(width, dtype=torch.float64, device="cpu"))
         self.region: Tensor
         arrives = library.value[:, -1] <= _ARRIVED * library.cost + 1e-9
         self.arrives = arrives & torch.isfinite(library.cost)
@@ -263,7 +263,7 @@ class GlobalValue(nn.Module):
             steps: T.
         """
         time = entries % self.length
-        ahead = (time.unsqueeze(1) + torch.arange(steps)).clamp(max=self.length - 1)
+        ahead = (time.unsqueeze(1) + torch.arange(steps, device="cpu")).clamp(max=self.length - 1)
         state, control, feedback = unpacked(self.problem, self.plans[(entries - time).unsqueeze(1) + ahead])
         shift = x - self.problem.offset(x, state[:, 0]) - state[:, 0]
         return control, Reference(state + shift.unsqueeze(1), feedback)
@@ -288,7 +288,7 @@ class GlobalValue(nn.Module):
         curvature = self.models[self.entries, 1 + n + n :].unflatten(-1, (n, n))
         along, axes = torch.linalg.eigh(self.region.unsqueeze(-1) * curvature * self.region)
         metric = ((axes * along.abs().unsqueeze(-2)) @ axes.mT).mean(0)
-        metric = metric + _ROUND * metric.diagonal().mean() * torch.eye(n, dtype=torch.float64)
+        metric = metric + _ROUND * metric.diagonal().mean() * torch.eye(n, dtype=torch.float64, device="cpu")
         frame: Tensor = torch.linalg.cholesky(metric / self.region / self.region.unsqueeze(-1))
         return frame
 
@@ -302,7 +302,9 @@ class GlobalValue(nn.Module):
         """Table of values: along the library, and then at the goal."""
         library, count, n = self.library, len(self.library.state), self.problem.dim
         parts = library.state, library.value.unsqueeze(-1), library.gradient, library.curvature.flatten(2)
-        linear = torch.cat((torch.zeros(1 + n, dtype=torch.float64), 2 * self.problem.p.flatten()))
+        linear = torch.cat(
+            (torch.zeros(1 + n, dtype=torch.float64, device="cpu"), 2 * self.problem.p.flatten())
+        )
         ends = torch.cat((self._goals(), linear.expand(count, -1)), dim=-1).unsqueeze(1)
         ends = ends.expand(-1, self.lookahead + 1, -1)
         return torch.cat((torch.cat(parts, dim=-1)[:, :-1], ends), dim=1).flatten(0, 1)

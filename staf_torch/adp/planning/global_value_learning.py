@@ -93,14 +93,14 @@ def learn_global_value(
     integer("learn_global_value", "rounds", rounds, least=0)
     integer("learn_global_value", "states", states, least=1)
     generator = torch.Generator().manual_seed(integer("learn_global_value", "seed", seed, least=0))
-    width = torch.as_tensor(region, dtype=torch.float64)
+    width = torch.as_tensor(region, dtype=torch.float64, device=getattr(region, "device", "cpu"))
     search = BoxDDP(problem, steps=steps, iterations=40, tolerance=1e-5)
 
     def memory(library: Trajectories) -> GlobalValue:
         return GlobalValue(problem, library, width, candidates=candidates, lookahead=lookahead)
 
     def drawn(count: int) -> Tensor:
-        uniform = torch.rand(count, problem.dim, generator=generator, dtype=torch.float64)
+        uniform = torch.rand(count, problem.dim, generator=generator, dtype=torch.float64, device="cpu")
         return problem.goal + width * (2 * uniform - 1)
 
     library = swept(memory(_first(search, drawn(trajectories), generator)), search)
@@ -132,7 +132,7 @@ def learn_global_value(
 def swept(memory: GlobalValue, search: BoxDDP) -> Trajectories:
     """The library of a memory, each trajectory optimised again from what the others know."""
     library = memory.library
-    own = torch.arange(len(library.cost))
+    own = torch.arange(len(library.cost), device="cpu")
     found = best_from(memory, search, library.state[:, 0], own)
     return chosen(found.cost < library.cost, found, library)
 
@@ -149,7 +149,7 @@ def best_from(memory: GlobalValue, search: BoxDDP, x: Tensor, own: Tensor | None
     guesses = _guesses(memory, search.steps, x, own)
     found = search.solve(x[guesses.owner], guesses.control, guesses.reference)
     order = found.cost.argsort(descending=True, stable=True)
-    best = torch.empty(len(x), dtype=torch.int64)
+    best = torch.empty(len(x), dtype=torch.int64, device=x.device)
     best[guesses.owner[order]] = order  # the last one written is the cheapest
     return rows_of(found, best)
 
@@ -158,11 +158,13 @@ def _first(search: BoxDDP, x: Tensor, generator: torch.Generator) -> Trajectorie
     """Optimised from the control at rest, and from two that jump between the bounds."""
     problem, steps = search.problem, search.steps
     levels, shape = problem.levels(), (2 * len(x), -(-steps // _HELD))
-    random = levels[torch.randint(len(levels), shape, generator=generator)].repeat_interleave(_HELD, 1)
+    random = levels[torch.randint(len(levels), shape, generator=generator, device="cpu")].repeat_interleave(
+        _HELD, 1
+    )
     still = problem.rest.expand(len(x), steps, -1)
     found = search.solve(x.repeat(3, 1), torch.cat((still, random[:, :steps])))
     best = found.cost.unflatten(0, (3, -1)).argmin(0)
-    return rows_of(found, best * len(x) + torch.arange(len(x)))
+    return rows_of(found, best * len(x) + torch.arange(len(x), device=x.device))
 
 
 def _guesses(memory: GlobalValue, steps: int, x: Tensor, own: Tensor | None) -> Guesses:

@@ -23,7 +23,7 @@ _SEED = 7
 
 def box_of(plant: Plant, dim: int) -> Tensor:
     """Half the width of a plant's box: its ``spread``, and of its angles all of them: (n,)."""
-    width = torch.full((dim,), float(plant.spread), dtype=torch.float64)
+    width = torch.full((dim,), float(plant.spread), dtype=torch.float64, device="cpu")
     width[list(plant.periodic)] = math.pi
     return width
 
@@ -61,7 +61,7 @@ def global_value_of(problem: SampledProblem, width: Tensor, steps: int) -> Globa
 def _enough_steps(problem: SampledProblem, width: Tensor, steps: int) -> int:
     """Steps in which nine of ten plans arrive at the goal; else the most."""
     generator = torch.Generator().manual_seed(_SEED)
-    uniform = torch.rand(_PROBED, problem.dim, dtype=torch.float64, generator=generator)
+    uniform = torch.rand(_PROBED, problem.dim, dtype=torch.float64, generator=generator, device="cpu")
     x0 = problem.goal + width * (2 * uniform - 1)
     while steps < _STEPS[1]:
         found = best_held(BoxDDP(problem, steps=steps, iterations=40, tolerance=1e-5), x0)

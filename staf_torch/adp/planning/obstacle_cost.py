@@ -74,8 +74,8 @@ class AvoidanceCost(QuadraticCost):
         self.reach = positive_real("AvoidanceCost", "reach", reach)
         self.kind = choice("AvoidanceCost", "kind", kind, ("penalty", "log"))
         heavy = positive_real("AvoidanceCost", "weight", weight)
-        self.register_buffer("weight", torch.tensor(heavy, dtype=torch.float64))
-        self.register_buffer("edge", torch.tensor(_EDGE, dtype=torch.float64))
+        self.register_buffer("weight", torch.tensor(heavy, dtype=torch.float64, device="cpu"))
+        self.register_buffer("edge", torch.tensor(_EDGE, dtype=torch.float64, device="cpu"))
         self.weight: Tensor
         self.edge: Tensor
 
@@ -173,7 +173,7 @@ def plan_around(
     ways = problem.levels()
     rows = x0.repeat_interleave(len(ways), dim=0)
     away = (ways - problem.rest).repeat(len(x0), 1)
-    pushed = torch.arange(steps) < steps // 4
+    pushed = torch.arange(steps, device="cpu") < steps // 4
     control: Tensor = problem.rest + torch.where(pushed[:, None], away.unsqueeze(1), 0.0)
     gains = (-problem.k).expand(len(rows), steps, -1, -1)
     around = Reference(problem.goal.expand(len(rows), steps, -1), gains)
@@ -192,5 +192,5 @@ def plan_around(
         now = AvoidancePlans(found, total, margin)
         best = now if best is None else best.or_cheaper(now)
     assert best is not None
-    chosen = best.cost.reshape(len(x0), -1).argmin(-1) + torch.arange(len(x0)) * len(ways)
+    chosen = best.cost.reshape(len(x0), -1).argmin(-1) + torch.arange(len(x0), device=x0.device) * len(ways)
     return AvoidancePlans(rows_of(best.trajectories, chosen), best.cost[chosen], best.margin[chosen])

@@ -224,7 +224,7 @@ def held_plans(search: BoxDDP, x: Tensor, best: int) -> list[Trajectories]:
     )
     cost = torch.where(torch.isfinite(found.cost), found.cost, torch.inf).view(count, b)
     order = cost.argsort(dim=0, stable=True)[:best]
-    return [rows_of(found, first * b + torch.arange(b)) for first in order]
+    return [rows_of(found, first * b + torch.arange(b, device="cpu")) for first in order]
 
 
 class BoundedPlans:

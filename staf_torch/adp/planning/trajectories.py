@@ -155,8 +155,12 @@ def first_controls(problem: SampledProblem, steps: int) -> Tensor:
     tried = [rest.expand(steps, -1)]
     for u in levels:
         lengths = (*(length for length in _LENGTHS if length < steps), steps)
-        tried += [torch.where(torch.arange(steps)[:, None] < length, u, rest) for length in lengths]
+        tried += [
+            torch.where(torch.arange(steps, device="cpu")[:, None] < length, u, rest) for length in lengths
+        ]
     draw = torch.Generator().manual_seed(0)
-    shares = torch.rand(_RANDOM, -(-steps // _HELD), problem.inputs, dtype=torch.float64, generator=draw)
+    shares = torch.rand(
+        _RANDOM, -(-steps // _HELD), problem.inputs, dtype=torch.float64, generator=draw, device="cpu"
+    )
     random = (low + (high - low) * shares).repeat_interleave(_HELD, 1)[:, :steps]
     return torch.cat((torch.stack(tried), random))

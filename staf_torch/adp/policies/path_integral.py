@@ -92,7 +92,7 @@ class PathIntegral(Controller):
         self.noise: Tensor
         self.register_buffer("spread", _hats(self.steps, self.knots))  # (T, knots)
         self.spread: Tensor
-        scales = torch.logspace(0, math.log10(_FINEST), self.samples, dtype=torch.float64)
+        scales = torch.logspace(0, math.log10(_FINEST), self.samples, dtype=torch.float64, device="cpu")
         self.register_buffer("scales", scales)  # (S,)
         self.scales: Tensor
         self.draws = -(-self.samples * self.knots * m // n)
@@ -150,5 +150,5 @@ class PathIntegral(Controller):
 
 def _hats(steps: int, knots: int) -> Tensor:
     """Weights of the knots at each step, linear between the knots: (T, knots)."""
-    place = torch.linspace(0, knots - 1, steps, dtype=torch.float64).unsqueeze(1)
-    return (1 - (place - torch.arange(knots, dtype=torch.float64)).abs()).clamp(min=0)
+    place = torch.linspace(0, knots - 1, steps, dtype=torch.float64, device="cpu").unsqueeze(1)
+    return (1 - (place - torch.arange(knots, dtype=torch.float64, device="cpu")).abs()).clamp(min=0)

@@ -152,10 +152,15 @@ class RolloutPolicy(nn.Module):
     def _check_steps(self, chosen: bool) -> None:
         """Find out by step doubling whether the steps are enough, and take more where they may be chosen."""
         rest = (
-            torch.zeros(self.basis.dim, dtype=torch.float64) if self.cost.target is None else self.cost.target
+            torch.zeros(self.basis.dim, dtype=torch.float64, device="cpu")
+            if self.cost.target is None
+            else self.cost.target
         )
         generator = torch.Generator().manual_seed(0)
-        away = 2 * torch.rand(_SAMPLES, self.basis.dim, dtype=torch.float64, generator=generator) - 1
+        away = (
+            2 * torch.rand(_SAMPLES, self.basis.dim, dtype=torch.float64, generator=generator, device="cpu")
+            - 1
+        )
         x, error = rest.double() + self.model.spread * away, math.inf
         now, first = self.rollout(x), self.steps
         while True:

@@ -229,7 +229,9 @@ class SampledRollout(nn.Module):
         assert self._followed is not None
         states, controls = self._followed(x, self.steps)
         paid = self.period * self.cost.rate(states[..., :-1, :], controls)
-        share = torch.exp(-self.cost.discount * self.period * torch.arange(self.steps + 1, dtype=x.dtype))
+        share = torch.exp(
+            -self.cost.discount * self.period * torch.arange(self.steps + 1, dtype=x.dtype, device=x.device)
+        )
         spent = (share[:-1] * paid).cumsum(-1)
         part = spent[..., first - 1] + share[first] * self.terminal(states[..., first, :])
         end = states[..., -1, :]
@@ -249,7 +251,9 @@ class SampledRollout(nn.Module):
 def _along(basis: StaFBasis) -> Along:
     middle = basis.centers.directions.new_zeros(basis.count, basis.dim)
     places = basis.centers(middle[0])
-    weights = fitted_slope(basis, middle, torch.eye(basis.count, dtype=middle.dtype)).mT  # a unit value a row
+    weights = fitted_slope(
+        basis, middle, torch.eye(basis.count, dtype=middle.dtype, device=middle.device)
+    ).mT  # a unit value a row
     at = (places == 0).all(-1).nonzero().flatten().tolist()
     return Along(places, weights, at[0] if at else None)
 

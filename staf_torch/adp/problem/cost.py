@@ -222,7 +222,7 @@ class Cost(nn.Module, abc.ABC):
         """Half the second derivative of e'Qe at the set-point, (n, n): Q, or C'QC with C = dy/dx."""
         if self.output is None:
             return self.q
-        at = torch.zeros(self.dim, dtype=torch.float64) if self.target is None else self.target
+        at = torch.zeros(self.dim, dtype=torch.float64, device="cpu") if self.target is None else self.target
         slope: Tensor = torch.func.jacrev(self.output)(at).detach()
         return slope.mT @ self.q @ slope
 
@@ -360,7 +360,7 @@ class BoundedInputCost(Cost):
             raise fail("BoundedInputCost", "control", "must be diagonal", control)
 
     def _prepare(self) -> None:
-        rest = torch.zeros(self.inputs, dtype=torch.float64)
+        rest = torch.zeros(self.inputs, dtype=torch.float64, device="cpu")
         rest = rest if self.target_input is None else self.target_input
         if self.bounds is None:
             raise fail("BoundedInputCost", "bound", "must be given, or low and high", None)
@@ -428,10 +428,14 @@ def square(call: str, name: str, value: Matrix, size: int) -> Tensor:
         return value.to(torch.float64) if value.dim() != 1 else value.to(torch.float64).diag()
     if isinstance(value, Sequence) and not isinstance(value, str):
         if value and all(isinstance(entry, int | float) for entry in value):
-            return torch.tensor(vector(call, name, value, len(value)), dtype=torch.float64).diag()
-        return torch.tensor([vector(call, name, row, len(value)) for row in value], dtype=torch.float64)
+            return torch.tensor(
+                vector(call, name, value, len(value)), dtype=torch.float64, device="cpu"
+            ).diag()
+        return torch.tensor(
+            [vector(call, name, row, len(value)) for row in value], dtype=torch.float64, device="cpu"
+        )
     number = real if name == "terminal" else positive_real  # nothing may be paid at the end
-    return number(call, name, value) * torch.eye(size, dtype=torch.float64)
+    return number(call, name, value) * torch.eye(size, dtype=torch.float64, device="cpu")
 
 
 def _point(call: str, name: str, value: Sequence[float] | Tensor | None, size: int) -> Tensor | None:
@@ -440,12 +444,12 @@ def _point(call: str, name: str, value: Sequence[float] | Tensor | None, size: i
     given = numbers_of(call, name, value)
     if isinstance(given, Sequence) and len(given) != size:
         raise fail(call, name, f"must have {size} numbers", value)
-    return torch.tensor(vector(call, name, given, size), dtype=torch.float64)
+    return torch.tensor(vector(call, name, given, size), dtype=torch.float64, device="cpu")
 
 
 def _outputs(call: str, output: Output, dim: int) -> int:
     """p: the size of the output at a batch of one state."""
-    seen = output(torch.zeros(1, dim, dtype=torch.float64))
+    seen = output(torch.zeros(1, dim, dtype=torch.float64, device="cpu"))
     if not isinstance(seen, Tensor) or seen.dim() != 2 or len(seen) != 1:
         shape = tuple(seen.shape) if isinstance(seen, Tensor) else seen
         raise fail(call, "output", f"must map (..., {dim}) to (..., p)", shape)

@@ -51,9 +51,9 @@ def exact_hold(f: Tensor, g: Tensor, q: Tensor, r: Tensor, period: float, *, dis
     """
     positive_real("exact_hold", "period", period)
     n, m = g.shape
-    whole = torch.zeros(n + m, n + m, dtype=torch.float64)
+    whole = torch.zeros(n + m, n + m, dtype=torch.float64, device="cpu")
     whole[:n, :n], whole[:n, n:] = f, g
-    whole = whole - 0.5 * discount * torch.eye(n + m, dtype=torch.float64)
+    whole = whole - 0.5 * discount * torch.eye(n + m, dtype=torch.float64, device="cpu")
     rate = torch.block_diag(q.double(), r.double())
     flow, paid = quadratic_integral(whole, rate, period)
     return Hold(flow[:n, :n], flow[:n, n:], paid)
@@ -91,9 +91,13 @@ def linear_hold(plant: Plant, cost: Cost, period: float) -> Hold:
     if plant.period is None:
         return exact_hold(f, g, q, cost.r, period, discount=cost.discount)
     share = math.exp(-0.5 * cost.discount * plant.period)
-    z = torch.zeros(len(f) + g.shape[1], len(f) + g.shape[1], dtype=torch.float64)
-    z[: len(f), : len(f)], z[: len(f), len(f) :], z[len(f) :, len(f) :] = f, g, torch.eye(g.shape[1]).to(g)
-    flow, paid = torch.eye(len(z), dtype=torch.float64), torch.zeros_like(z)
+    z = torch.zeros(len(f) + g.shape[1], len(f) + g.shape[1], dtype=torch.float64, device="cpu")
+    z[: len(f), : len(f)], z[: len(f), len(f) :], z[len(f) :, len(f) :] = (
+        f,
+        g,
+        torch.eye(g.shape[1], device="cpu").to(g),
+    )
+    flow, paid = torch.eye(len(z), dtype=torch.float64, device="cpu"), torch.zeros_like(z)
     rate = plant.period * torch.block_diag(q.double(), cost.r.double())
     for _ in range(periods("linear_hold", plant, period)):
         paid = paid + flow.mT @ rate @ flow
@@ -119,7 +123,7 @@ def held_riccati(plant: Plant, cost: Cost, period: float) -> tuple[Tensor, Tenso
     f, g = plant.linearisation(cost.target, cost.target_input)
     rest = math.exp(-0.5 * cost.discount * plant.period) if plant.period is not None else 1.0
     if plant.period is None:
-        f = f - 0.5 * cost.discount * torch.eye(n, dtype=f.dtype)
+        f = f - 0.5 * cost.discount * torch.eye(n, dtype=f.dtype, device=f.device)
     check_modes(
         rest * f.double(),
         rest * g.double(),
@@ -233,7 +237,7 @@ class HeldLoop(NamedTuple):
         if float(modes.real.max()) >= 0:
             return None
         first, last = (math.log10(reach / float(modes.abs().max())) for reach in _REACH)
-        periods = torch.logspace(first, last, _PERIODS, dtype=torch.float64).tolist()
+        periods = torch.logspace(first, last, _PERIODS, dtype=torch.float64, device="cpu").tolist()
         count = next((k for k, dt in enumerate(periods) if self.spectral_radius(dt) >= 1), None)
         if count is None:
             return math.inf
@@ -258,16 +262,16 @@ def _moved(f: Tensor, g: Tensor, *, discrete: bool) -> Tensor:
     count = int((sizes > _REACHED * sizes.amax()).sum())
     rest = left[:, count:]
     if count in (0, size):
-        return torch.eye(size, dtype=f.dtype)
+        return torch.eye(size, dtype=f.dtype, device=f.device)
     modes = torch.linalg.eigvals(rest.mT @ f @ rest)
     grows = modes.abs().max() > 1 + _GROWS if discrete else modes.real.max() > _GROWS * scale
-    return torch.eye(size, dtype=f.dtype) if bool(grows) else left[:, :count]
+    return torch.eye(size, dtype=f.dtype, device=f.device) if bool(grows) else left[:, :count]
 
 
 def _held(plant: Plant, f: Tensor, g: Tensor, dt: float) -> tuple[Tensor, Tensor]:
     """A and B of the linearised plant over dt seconds with u held."""
     n, m = g.shape
-    moved, held = torch.cat((f, g), dim=1), torch.eye(n + m, dtype=f.dtype)[n:]
+    moved, held = torch.cat((f, g), dim=1), torch.eye(n + m, dtype=f.dtype, device=f.device)[n:]
     if plant.period is None:
         flow = exponential(dt * torch.cat((moved, 0 * held)))
     else:

@@ -123,7 +123,7 @@ def regulated(call: str, plant: Plant, cost: Cost, argument: str = "cost") -> Co
 def set_point(plant: Plant, cost: Cost) -> tuple[Tensor, Tensor]:
     """Return the state and the input, (n,) and (m,), at which a cost around a plant wants it to rest."""
     x = plant.equilibrium() if cost.target is None else cost.target
-    none = torch.zeros(cost.inputs, dtype=torch.float64)
+    none = torch.zeros(cost.inputs, dtype=torch.float64, device="cpu")
     return x, none if cost.target_input is None else cost.target_input
 
 
@@ -137,7 +137,7 @@ def check_regulates(call: str, plant: Plant, cost: Cost) -> None:
     """
     still_plant, still = cost.regulated(plant)
     x = set_point(still_plant, still)[0]
-    near = _NEAR * (1 + x.abs()) * torch.eye(len(x), dtype=x.dtype)
+    near = _NEAR * (1 + x.abs()) * torch.eye(len(x), dtype=x.dtype, device=x.device)
     with torch.no_grad():
         rates = still.state_rate(torch.cat((x.unsqueeze(0), x + near, x - near)))
     at, least = float(rates[0]), float(rates.min())

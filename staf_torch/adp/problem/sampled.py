@@ -95,8 +95,8 @@ class SampledProblem(nn.Module):
         self.path: Path | None = path
         self.dim = integer("SampledProblem", "dim", dim, least=1)
         self.inputs = integer("SampledProblem", "inputs", inputs, least=1)
-        zeros = torch.zeros(self.dim, dtype=torch.float64)
-        none = torch.zeros(self.inputs, dtype=torch.float64)
+        zeros = torch.zeros(self.dim, dtype=torch.float64, device="cpu")
+        none = torch.zeros(self.inputs, dtype=torch.float64, device="cpu")
         self.bounds = Bounds(low, high, self.inputs)
         self.register_buffer("goal", zeros if goal is None else goal.double())
         self.register_buffer("rest", none if rest is None else rest.double())
@@ -208,7 +208,7 @@ class SampledProblem(nn.Module):
         first are near those of x, of every other one near those of the one before."""
         if self.path is None:
             return (x - self.offset(x, self.goal)).unsqueeze(1).expand(-1, steps + 1, -1)
-        time = x[:, -1:] + self.tick * torch.arange(steps + 1, dtype=x.dtype)
+        time = x[:, -1:] + self.tick * torch.arange(steps + 1, dtype=x.dtype, device=x.device)
         goal = torch.cat((self.path(time), time.unsqueeze(-1)), dim=-1)
         begun = turned(goal[:, :1], x.unsqueeze(1), self.periodic)
         return unwrapped(goal, self.periodic) + (begun - goal[:, :1])
@@ -383,12 +383,12 @@ def _in_pairs(function: Callable[[Tensor], Tensor], z: Tensor, count: int) -> tu
         found = torch.func.jvp(lambda y: torch.func.jvp(function, (y,), (one,))[1], (at,), (other,))
         return torch.cat((found[0], found[1]), dim=-1)
 
-    unit = torch.eye(z.shape[-1], dtype=z.dtype)
-    rows, columns = torch.tril_indices(len(unit), len(unit)).unbind(0)
+    unit = torch.eye(z.shape[-1], dtype=z.dtype, device=z.device)
+    rows, columns = torch.tril_indices(len(unit), len(unit), device="cpu").unbind(0)
     pairs = torch.cat((unit[rows], unit[columns]), dim=-1).expand(len(z), -1, -1)
     slope, bend = each(along, pairs, together=1).split(count, dim=-1)  # (B, pairs, count)
-    place = torch.zeros(len(unit), len(unit), dtype=torch.int64)
-    place[rows, columns] = place[columns, rows] = torch.arange(len(rows))
+    place = torch.zeros(len(unit), len(unit), dtype=torch.int64, device="cpu")
+    place[rows, columns] = place[columns, rows] = torch.arange(len(rows), device="cpu")
     return slope[:, rows == columns].mT, bend[:, place.flatten()].mT.unflatten(-1, place.shape)
 
 

@@ -65,7 +65,7 @@ class TrackingCost(QuadraticCost):
         q = torch.nn.functional.pad(still.q, (0, 1, 0, 1))
         super().__init__(q, still.r, dim + 1, inputs, low=low, high=high, target_input=target_input)
         self.still, self.path = still, path
-        seen = path(torch.zeros(2, dtype=torch.float64))
+        seen = path(torch.zeros(2, dtype=torch.float64, device="cpu"))
         if not isinstance(seen, Tensor) or seen.shape != (2, dim):
             shape = tuple(seen.shape) if isinstance(seen, Tensor) else seen
             raise fail("TrackingCost", "path", f"must map times (2,) to states (2, {dim})", shape)
@@ -98,7 +98,7 @@ class TrackingCost(QuadraticCost):
 
     def set_point(self) -> Tensor:
         """The path at t = 0, without the time, (n,)."""
-        return self.path(torch.zeros((), dtype=torch.float64))
+        return self.path(torch.zeros((), dtype=torch.float64, device="cpu"))
 
     def deviation(self, x: Tensor) -> Tensor:
         """(x - x_d(t), 0), angles in [-pi, pi]: (..., n + 1) -> (..., n + 1)."""

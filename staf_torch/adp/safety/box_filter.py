@@ -178,7 +178,7 @@ class BoxFilter(nn.Module):
         -> (B, W, m), (B, W)."""
         value, pull = torch.func.vjp(lambda u: self._conditions(s, u, hold, left), u)  # type: ignore[misc]
         # Reverse mode: forward mode in plain torch takes a hundred times as long, for its own reasons.
-        walls = torch.eye(len(self.walls)).to(u)
+        walls = torch.eye(len(self.walls), device="cpu").to(u)
         normal = torch.func.vmap(lambda one: pull(one.expand_as(value))[0], out_dims=1)(walls)
         return normal, (normal * u.unsqueeze(-2)).sum(-1) - value
 
@@ -247,7 +247,9 @@ def _summit(first: Tensor, last: Tensor, rise: Tensor, fall: Tensor, length: Ten
 def _degrees(box: Barrier) -> list[int]:
     """Return for every coordinate which derivative of x the inputs move, 1 or 2; 0 for neither."""
     plant, size = box.plant, box.dim or 0
-    share = torch.rand(_PROBES, size, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    share = torch.rand(
+        _PROBES, size, dtype=torch.float64, generator=torch.Generator().manual_seed(0), device="cpu"
+    )
     x = box.floor.cpu() + (box.ceiling - box.floor).cpu() * share
     rest = plant.resting_input().to(x).expand(_PROBES, -1)
     found = []

@@ -87,7 +87,7 @@ class Conditions(nn.Module):
         count = len(self.constraints)
         kept = one_or_each("SafetyFilter", "margin", margin, count)
         self.register_buffer("margin", non_negative("SafetyFilter", "margin", kept))
-        self.register_buffer("decay", torch.ones(count, dtype=torch.float64))
+        self.register_buffer("decay", torch.ones(count, dtype=torch.float64, device="cpu"))
         self.margin: Tensor  # (k,)
         self.decay: Tensor  # (k,) 1/s
         if decay is not None:
@@ -108,15 +108,15 @@ class Conditions(nn.Module):
         self.weak: tuple[bool, ...] = found.weak
         self.apart: bool = found.apart
         if decay is None:
-            self.decay.copy_(torch.tensor(found.decay, dtype=torch.float64))
-        second = torch.tensor(self.degree, dtype=torch.int64) == 2
+            self.decay.copy_(torch.tensor(found.decay, dtype=torch.float64, device="cpu"))
+        second = torch.tensor(self.degree, dtype=torch.int64, device="cpu") == 2
         if bool((second & (self.decay * self.hold > 1)).any()):
             rule = f"must be at most 1/dt = {1 / self.hold:g} where the relative degree is two"
             raise fail("SafetyFilter", "decay", rule, decay)
 
     def margins(self, x: Tensor, t: float | Tensor = 0.0) -> Tensor:
         """h of every constraint: (..., n) and a number or (...) -> (..., k)."""
-        time = torch.as_tensor(t).to(x).expand(x.shape[:-1]).reshape(-1)
+        time = torch.as_tensor(t, device=x.device).to(x).expand(x.shape[:-1]).reshape(-1)
         rows = x.reshape(-1, x.shape[-1])
         columns = [torch.func.vmap(h)(rows.unsqueeze(1), time) for h in map(number, self.constraints)]
         return torch.stack(columns, dim=-1).reshape(*x.shape[:-1], -1)
@@ -256,13 +256,15 @@ class Conditions(nn.Module):
     def _around(self) -> tuple[Tensor, Tensor]:
         """Return states around the equilibrium, and times."""
         generator = torch.Generator().manual_seed(0)
-        around = torch.randn(_PROBES, self.plant.dim or 0, dtype=torch.float64, generator=generator)
+        around = torch.randn(
+            _PROBES, self.plant.dim or 0, dtype=torch.float64, generator=generator, device="cpu"
+        )
         x = (self.plant.equilibrium() + around).repeat(len(TIMES), 1)
-        return x, torch.tensor(TIMES, dtype=torch.float64).repeat_interleave(_PROBES)
+        return x, torch.tensor(TIMES, dtype=torch.float64, device="cpu").repeat_interleave(_PROBES)
 
     def _check_shapes(self, x: Tensor) -> None:
         for k, h in enumerate(self.constraints):
-            shape = tuple(h(x[:3], torch.zeros((), dtype=x.dtype)).shape)
+            shape = tuple(h(x[:3], torch.zeros((), dtype=x.dtype, device=x.device)).shape)
             if shape != (3,):
                 raise fail("SafetyFilter", "constraints", f"must map (3, n) to (3,), number {k}", shape)
 

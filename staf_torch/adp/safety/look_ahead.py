@@ -253,7 +253,7 @@ def opposition(of: Conditions, policy: Policy | None) -> Opposed:
     alone, is an unstable zero: the constraint's coordinate must first move the wrong way.
     """
     count = len(of.constraints)
-    none = Opposed(torch.zeros(count, dtype=torch.float64), None, None)
+    none = Opposed(torch.zeros(count, dtype=torch.float64, device="cpu"), None, None)
     plant = of.plant
     rest, at = plant.resting_input().double(), plant.equilibrium().double()
     try:
@@ -272,7 +272,7 @@ def opposition(of: Conditions, policy: Policy | None) -> Opposed:
     fast = float(torch.linalg.eigvals(closed).abs().max())
     if alone is not None and alone > _UNSTABLE * fast:
         return none  # the policy brings nothing back by itself
-    rates = torch.zeros(count, dtype=torch.float64)
+    rates = torch.zeros(count, dtype=torch.float64, device="cpu")
     x, _ = of._around()
     normals = [torch.func.vmap(torch.func.grad(lambda x, h=h: h(x.unsqueeze(0), x.new_zeros(()))[0]))
                for h in of.constraints]  # fmt: skip
@@ -283,7 +283,10 @@ def opposition(of: Conditions, policy: Policy | None) -> Opposed:
             rates[k] = middle
     bowl = None
     if alone is not None and alone < 0 and bool((rates > 0).any()):
-        eye, turned = torch.eye(len(a), dtype=a.dtype), closed.mT.contiguous()  # A'P + PA = -1
+        eye, turned = (
+            torch.eye(len(a), dtype=a.dtype, device=a.device),
+            closed.mT.contiguous(),
+        )  # A'P + PA = -1
         bowl = torch.linalg.solve(torch.kron(eye, turned) + torch.kron(turned, eye), -eye.flatten())
         bowl = bowl.unflatten(0, eye.shape)
     return Opposed(rates, alone, bowl)
@@ -295,7 +298,7 @@ def _growth(c: Tensor, a: Tensor, b: Tensor, closed: Tensor, decay: float, degre
     size = float(push.square().sum())
     if not size > 1e-12 * float((c.square().sum() * b.square().sum()).clamp(min=1e-300)):
         return None
-    eye = torch.eye(len(a), dtype=a.dtype)
+    eye = torch.eye(len(a), dtype=a.dtype, device=a.device)
     along = closed - torch.outer(b @ push, phi @ (closed + decay * eye)) / size
     modes = torch.linalg.eigvals(along)
     growth, before = float(modes.real.max()), float(torch.linalg.eigvals(closed).real.max())

@@ -74,7 +74,7 @@ def cases(count: int, low: Sequence[float], high: Sequence[float]) -> Tensor:
             f"{MOST_CASES}: join some, for example by their smooth minimum."
         )
     held = [(*ones, *sides) for ones in active[1:] for sides in itertools.product(*bounds)]
-    return torch.tensor([(0,) * (count + len(bounds)), *held], dtype=torch.float64)
+    return torch.tensor([(0,) * (count + len(bounds)), *held], dtype=torch.float64, device="cpu")
 
 
 def nearest_admissible(
@@ -130,7 +130,7 @@ def _interval(wanted: Tensor, unit: Tensor, far: Tensor, low: Tensor, high: Tens
 
 def _in_plane(wanted: Tensor, unit: Tensor, far: Tensor, low: Tensor, high: Tensor) -> Tensor:
     """Two unknowns: the nearest corner or foot that satisfies all, else least squares of what is missing."""
-    sides = torch.eye(2).to(wanted)
+    sides = torch.eye(2, device="cpu").to(wanted)
     sides = torch.cat((sides, -sides))
     lines = torch.cat((unit, sides.expand(*unit.shape[:-2], -1, -1)), dim=-2)
     aims = torch.cat((far, torch.cat((low, -high)).to(far).expand(*far.shape[:-1], -1)), dim=-1)
@@ -190,7 +190,7 @@ def _least_squares(wanted: Tensor, unit: Tensor, far: Tensor, low: Tensor, high:
             found += [u, (paid + give * (u - start.unsqueeze(-2)).square().sum(-1)).unsqueeze(-1)]
         return torch.cat(found, dim=-1)
 
-    subsets = torch.tensor(list(itertools.product((0.0, 1.0), repeat=count))[1:]).to(wanted)
+    subsets = torch.tensor(list(itertools.product((0.0, 1.0), repeat=count))[1:], device="cpu").to(wanted)
     shape = (*wanted.shape[:-1], *subsets.shape)
     found = each(subset, subsets.expand(shape), dim=wanted.dim() - 1, together=1).unflatten(-1, (5, 3))
     found = found.flatten(-3, -2)

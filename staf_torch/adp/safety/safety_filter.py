@@ -233,7 +233,7 @@ class SafetyFilter(Controller):
         trailing("SafetyFilter", "u", u, 1, self.plant.inputs)
         if t is None and self.moving:
             raise fail("SafetyFilter", "t", "must be given: a constraint depends on the time", t)
-        time = torch.as_tensor(0.0 if t is None else t).to(x).expand(x.shape[:-1])
+        time = torch.as_tensor(0.0 if t is None else t, device=x.device).to(x).expand(x.shape[:-1])
         if self.ahead.by_policy:
             self._nearest.hasten()  # hundreds of periods are followed: seconds in plain torch
         found, k = self._nearest(torch.cat((x, u, time.unsqueeze(-1)), dim=-1)), len(self.constraints)

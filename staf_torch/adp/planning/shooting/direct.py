@@ -233,7 +233,7 @@ class DirectShooting:
         parts = list[Optimum]()
         with Sign("", len(x0), "states") as sign:
             for k, rows in enumerate(x0.split(ROWS)):
-                at = k * ROWS + torch.arange(len(rows))
+                at = k * ROWS + torch.arange(len(rows), device="cpu")
                 parts.append(self._solve(rows, None if warm is None else selected(warm, at)))
                 sign.advance(len(rows))
         return parts[0] if len(parts) == 1 else joined(parts)
@@ -280,7 +280,7 @@ class DirectShooting:
         """Times of the coarse mesh: in equal steps where plans are searched in such."""
         if self._graded():
             return graded(horizon, intervals)
-        return torch.linspace(0, horizon, intervals + 1, dtype=torch.float64)
+        return torch.linspace(0, horizon, intervals + 1, dtype=torch.float64, device="cpu")
 
     def _several(self, found: Optimum, rows: Tensor, plans: list[MeshPlan], time: Tensor) -> Optimum:
         """The best of what was found and of what several plans lead to, in some rows."""
@@ -290,7 +290,7 @@ class DirectShooting:
         together = MeshPlan(*(torch.cat(parts) for parts in zip(*plans, strict=True)))
         x0 = together.state[:, 0]
         improved = self._improve(together, time, x0, self.bases[0])
-        places = torch.arange(len(rows))
+        places = torch.arange(len(rows), device=rows.device)
         several = [selected(improved, k * len(rows) + places) for k in range(len(plans))]
         return merged(found, rows, several)
 

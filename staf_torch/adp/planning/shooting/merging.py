@@ -33,7 +33,7 @@ def cheapest(plans: list[MeshPlan], count: int, used: Tensor) -> list[MeshPlan]:
     earlier = torch.ones_like(same[..., 0]).tril(-1).unsqueeze(-1)  # plan i after plan j
     costs = torch.where((same & earlier).any(1), torch.inf, costs)[1:]
     order = costs.argsort(dim=0, stable=True)[: min(count, len(plans))]
-    rows = torch.arange(costs.shape[1])
+    rows = torch.arange(costs.shape[1], device="cpu")
     state, control = (torch.stack([getattr(p, name) for p in plans]) for name in ("state", "control"))
     return [MeshPlan(state[k, rows], control[k, rows], costs[k, rows]) for k in order]
 
@@ -58,7 +58,7 @@ def merged(found: Optimum, rows: Tensor, several: list[Optimum]) -> Optimum:
     same = values <= values.amin(0) + _SAME * values.amin(0).abs()
     known = torch.stack([_stationary(each) for each in every])
     count = (same & known).sum(0)  # starts that found the lowest value
-    places = torch.arange(len(rows))
+    places = torch.arange(len(rows), device=rows.device)
     columns = {}
     for name, whole in _tensors(found).items():
         chosen = torch.stack([getattr(each, name) for each in every])[best, places]
@@ -85,7 +85,7 @@ def merged(found: Optimum, rows: Tensor, several: list[Optimum]) -> Optimum:
 def _stationary(optimum: Optimum) -> Tensor:
     """Rows of a start that it ended well in, also those that no other start agreed with, (B,) bool."""
     lone = [reason.startswith(_LONE) for reason in optimum.reason]
-    return optimum.converged | torch.tensor(lone, dtype=torch.bool)
+    return optimum.converged | torch.tensor(lone, dtype=torch.bool, device="cpu")
 
 
 def joined(parts: list[Optimum]) -> Optimum:

@@ -14,7 +14,11 @@ _GRADING = 6.0  # ratio of a mesh's last interval to the first
 
 def graded(horizon: float, intervals: int) -> Tensor:
     """Times of a mesh whose intervals grow in geometric progression: (N + 1,) from 0 to the horizon."""
-    power = math.log(_GRADING) * torch.arange(intervals + 1, dtype=torch.float64) / max(1, intervals - 1)
+    power = (
+        math.log(_GRADING)
+        * torch.arange(intervals + 1, dtype=torch.float64, device="cpu")
+        / max(1, intervals - 1)
+    )
     return horizon * power.expm1() / power[-1].expm1()
 
 

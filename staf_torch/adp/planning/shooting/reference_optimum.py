@@ -46,7 +46,7 @@ def compare(problem: AdpProblem, result: LoopResult) -> LoopOptimum:
     start = result.state[:, 0]
     batch, times = result.state.shape[:2]
     formula = known_value(problem, start) is not None
-    at = torch.arange(times) if formula else _chosen(times, problem.optimum.states // batch)
+    at = torch.arange(times, device="cpu") if formula else _chosen(times, problem.optimum.states // batch)
     found = optima(problem, result.state[:, at])
     if found is None:
         return LoopOptimum(None, None, None)
@@ -106,7 +106,7 @@ def known_value(problem: AdpProblem, x: Tensor) -> Tensor | None:
 def _chosen(times: int, count: int) -> Tensor:
     """``count`` of the recorded times, evenly, from the first; at least the first."""
     count = max(1, min(count, times - 1))
-    return torch.arange(count) * (times - 1) // count
+    return torch.arange(count, device="cpu") * (times - 1) // count
 
 
 def _spread(values: Tensor, at: Tensor, times: int) -> Tensor:
@@ -119,7 +119,7 @@ def _estimates(problem: AdpProblem, result: LoopResult, at: Tensor) -> Tensor | 
     """V^ at the recorded states of the times ``at`` with the weights of then, (B, len(at))."""
     pieces, x = [], result.state[:, at].flatten(0, 1)
     known = {name: part[:, at].flatten(0, 1) for name, part in result.recorded.items()}
-    for some in torch.arange(len(x)).split(_AT_ONCE):
+    for some in torch.arange(len(x), device="cpu").split(_AT_ONCE):
         with torch.no_grad():
             value = problem.controller.value(x[some], {name: part[some] for name, part in known.items()})
         if value is None:

@@ -37,7 +37,7 @@ def guesses(
         seed: of them.
         alone: whether the base is the input at rest: it does not say how large a control is.
     """
-    rest = torch.zeros(cost.inputs, dtype=torch.float64)
+    rest = torch.zeros(cost.inputs, dtype=torch.float64, device="cpu")
     rest = rest if cost.target_input is None else cost.target_input
     wanted = (base(x0) - rest.to(x0)).abs().amax(0).clamp(min=1.0 if alone else 1e-3).to(rest)
     low, high = rest - _REACH * wanted, rest + _REACH * wanted
@@ -55,8 +55,8 @@ def guesses(
                 found.append(StartControl(level.expand(2, -1), share * horizon))
     generator = torch.Generator().manual_seed(seed)
     for _ in range(count):
-        knots = torch.rand(_KNOTS, cost.inputs, dtype=torch.float64, generator=generator)
-        until = float(torch.rand((), dtype=torch.float32, generator=generator)) * 0.6 * horizon
+        knots = torch.rand(_KNOTS, cost.inputs, dtype=torch.float64, generator=generator, device="cpu")
+        until = float(torch.rand((), dtype=torch.float32, generator=generator, device="cpu")) * 0.6 * horizon
         found.append(StartControl(low + (high - low) * (1.5 * knots - 0.25).clamp(0.0, 1.0), until))
     return found
 
