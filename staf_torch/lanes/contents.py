@@ -318,15 +318,6 @@ class Walk(pickle.Pickler):
         self._waiting: list[FunctionType | type] = []  # whose surroundings are to be written
         self._met: dict[int, int] = {}  # of a function or class of a user: its place among the kept
 
-    def noted(self, value: Any) -> None:
-        """Note the parameters and buffers of a module, where it cannot be written down."""
-        for part in value.modules() if isinstance(value, nn.Module) else ():
-            if any(map(_is_layer, type(part).__mro__)):
-                self.layers.update(map(id, part._parameters.values()))
-            for tensor in (*part._parameters.values(), *part._buffers.values()):
-                if tensor is not None:
-                    self.persistent_id(tensor)
-
     def finish(self) -> None:
         """Write what the functions and classes of a user read that were come upon, and so on."""
         while self._waiting:

@@ -8,6 +8,7 @@ and what is computed with them refuses the backward pass to them.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import inspect
@@ -111,7 +112,7 @@ def without_gradient(call: str, *names: str) -> Callable[[Callable[_P, _R]], Cal
     return decorated
 
 
-def _wanting(value: Any) -> tuple[list[Tensor], list[Tensor]]:
+def _wanting(value: Any, depth: int = 6) -> tuple[list[Tensor], list[Tensor]]:
     """Return the tensors of an object that require a gradient: of somebody, and parameters of layers."""
     if value is None or isinstance(value, Tensor):
         return ([value] if value is not None and value.requires_grad else []), []
@@ -119,11 +120,25 @@ def _wanting(value: Any) -> tuple[list[Tensor], list[Tensor]]:
     try:
         walk.dump(value)
         walk.finish()
-    except Exception:  # an open file, a lock: what came before it is known
-        walk.noted(value)
+    except Exception:  # an open file, a lock: beside it there may be tensors
+        parts = [_wanting(part, depth - 1) for part in _inside(value)] if depth else []
+        return [t for some, _ in parts for t in some], [t for _, some in parts for t in some]
     found = [part for part in walk.tensors if part.requires_grad]
     layers = [part for part in found if id(part) in walk.layers]
     return [part for part in found if id(part) not in walk.layers], layers
+
+
+def _inside(value: Any) -> list[Any]:
+    """Return what a container, a function or an object leads to, one step deep."""
+    if isinstance(value, dict):
+        return [*value.values()]
+    if isinstance(value, list | tuple | set):
+        return [*value]
+    closed: list[Any] = []
+    for cell in getattr(value, "__closure__", None) or ():
+        with contextlib.suppress(ValueError):  # of a name without a value yet
+            closed.append(cell.cell_contents)
+    return [*closed, getattr(value, "__self__", None), *getattr(value, "__dict__", {}).values()]
 
 
 class _Unserved(torch.autograd.Function):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -128,6 +129,9 @@ def test_the_gradient_of_a_closed_loop_with_a_penalty_is_no_half_of_it() -> None
     gain = nn.Parameter(torch.ones(1, 2).double())
     own = nn.Module()
     own.gain, own.forward = gain, lambda x: -x @ gain.mT  # type: ignore[method-assign]
+    with pytest.raises(ValueError, match="`controller` holds a tensor"):
+        loop(own)
+    own.lock = threading.Lock()  # what cannot be written down hides nothing beside it
     with pytest.raises(ValueError, match="`controller` holds a tensor"):
         loop(own)
     gain.requires_grad_(False)
