@@ -133,7 +133,7 @@ def bounds(axes: Axes, low: np.ndarray, high: np.ndarray) -> str:
     """Draw the bounds of inputs, (m,) each; of those far from all that is drawn, return a word."""
     limits = {float(each) for each in (*low, *high) if np.isfinite(each)}
     bottom, top = axes.get_ylim()
-    reach = _SEEN * (top - bottom)
+    reach = _SEEN * max(top - bottom, 0.5 * abs(top), 0.5 * abs(bottom))  # a control may rest at a bound
     seen = {each for each in limits if top - reach < each < bottom + reach}
     for each in sorted(limits):
         line = axes.axhline(each, color="0.25", linewidth=0.9, linestyle=_BOUND)

@@ -57,6 +57,7 @@ _DASHES: tuple[Any, ...] = (
     (0, (4, 1, 1, 1, 1, 1)),
 )  # dotted is what is ideal, true or wanted
 _PANEL = 2.2  # inches that a panel is wide, at least, with type of 8 pt
+_ROUNDING = 1e-6  # of the numbers at an axis: less is no difference
 _ROOM = 0.12  # of an axis, between two numbers on it
 _HIGHEST = 9.0  # inches of all panels: a page
 _STRIP, _TALL = 1.35, 2.0  # inches that it is high, in one column and in several
@@ -186,6 +187,7 @@ def page(height: float) -> Iterator[Figure]:
             yield figure
             engine = figure.get_layout_engine()
             assert engine is not None
+            _widen_the_constant(figure)
             _label_the_lowest(figure)
             engine.execute(figure)
             if sum(map(place, wanted)) or any(axes.get_aspect() != "auto" for axes in figure.axes):
@@ -270,6 +272,15 @@ def images(figure: Figure) -> dict[str, bytes]:
     if kept is not None:
         kept.append((figure, drawn["png"]))
     return drawn
+
+
+def _widen_the_constant(figure: Figure) -> None:
+    """Give a vertical axis whose numbers differ by rounding alone a twentieth of them on both sides."""
+    for axes in figure.axes:
+        low, high = axes.get_ylim()
+        largest = max(abs(low), abs(high))
+        if axes.get_yscale() == "linear" and high - low < _ROUNDING * largest:
+            axes.set_ylim(low - 0.05 * largest, high + 0.05 * largest)
 
 
 def _label_the_lowest(figure: Figure) -> None:

@@ -14,6 +14,7 @@ from figures.drawing import lines, visible
 from torch import Tensor
 
 from staf_torch import adp, systems
+from staf_torch.figures.style import page
 
 pytest.importorskip("scipy", reason="the LQR needs the extra adp")
 
@@ -103,6 +104,19 @@ def test_a_closed_loop_is_drawn_with_units_bounds_and_the_lqr_beside(case: Any) 
         assert "bounds -1000, 1000" in grid[-2].get_title(loc="left")
     wanted = [y for name, _, y in lines(grid[0]) if name == "wanted"]
     assert len(wanted) == (case is tracking)
+
+
+@pytest.mark.usefixtures("not_laid_out")
+@pytest.mark.parametrize("rest", [-0.5, 3.0])
+def test_a_control_that_differs_by_rounding_has_an_axis_of_its_size(rest: float) -> None:
+    figure = run(pendulum, lambda x: rest + 1e-12 * x[..., :1]).figure(lqr=False)
+    control = visible(figure)[2]
+    low, high = control.get_ylim()
+    assert low < -0.5 < 0.7 < high  # clipped to a bound: both are seen
+    assert {float(y[0]) for _, x, y in lines(control) if list(x) == [0, 1]} == {-0.5, 0.7}
+    with page(2.0) as other:
+        other.subplots().plot([0, 1], [5.0, 5.0 + 1e-12])
+    assert np.ptp(other.axes[0].get_ylim()) > 0.4
 
 
 def test_a_closed_loop_says_in_five_lines_what_it_was() -> None:
