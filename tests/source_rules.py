@@ -7,6 +7,8 @@ import re
 from collections.abc import Iterator, Sequence
 
 _MAKERS = ("zeros", "ones", "full", "empty", "eye", "linspace", "logspace", "rand", "randn", "tensor")
+_ANYWHERE = {*_MAKERS, "arange", "as_tensor", "empty_strided", "randint", "randperm", "scalar_tensor"}
+_ANYWHERE |= {"tril_indices", "triu_indices"}
 _CASTS = ("double", "to", "long", "type_as")
 _TEXT = ("read_text", "write_text")
 _DOCUMENTED = {"_asdict", "_field_defaults", "_fields", "_make", "_replace", "_exit", "_dynamo", "_inductor"}
@@ -30,6 +32,19 @@ def without_dtype(nodes: Sequence[ast.AST]) -> Iterator[str]:
             and id(node) not in cast
             and ast.unparse(node.func.value) == "torch"
             and not any(word.arg in ("dtype", "out", None) for word in node.keywords)
+        ):
+            yield f"{node.lineno}: {ast.unparse(node)[:80]}"
+
+
+def without_device(nodes: Sequence[ast.AST]) -> Iterator[str]:
+    """Calls that make a tensor on torch's default device, which is the user's: by line."""
+    for node in nodes:
+        if (
+            isinstance(node, ast.Call)
+            and isinstance(node.func, ast.Attribute)
+            and node.func.attr in _ANYWHERE
+            and ast.unparse(node.func.value) == "torch"
+            and not any(word.arg in ("device", "out", None) for word in node.keywords)
         ):
             yield f"{node.lineno}: {ast.unparse(node)[:80]}"
 

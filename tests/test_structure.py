@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import pytest
 import yaml
 from command_line import ROOT
-from source_rules import looks_inside, without_dtype, without_encoding
+from source_rules import looks_inside, without_device, without_dtype, without_encoding
 
 import staf_torch
 
@@ -57,9 +57,8 @@ def about(name: str) -> About:
     path = MODULES[name]
     tree = nodes(path)
     kinds = (node.name for node in tree if isinstance(node, ast.ClassDef))
-    return About(
-        imports(name, path, tree), tuple(kinds), tuple(told(path, tree, without_dtype, without_encoding))
-    )
+    said = told(path, tree, without_dtype, without_device, without_encoding)
+    return About(imports(name, path, tree), tuple(kinds), tuple(said))
 
 
 # --- imports ------------------------------------------------------------------------------------------------
@@ -222,8 +221,8 @@ def told(path: Path, tree: Sequence[ast.AST], *rules: Rule) -> list[str]:
     return [f"{path.relative_to(ROOT)}:{line}" for rule in rules for line in rule(tree)]
 
 
-def test_no_number_depends_on_the_default_dtype_of_torch_and_no_text_on_a_locale() -> None:
-    """These are the user's: every tensor that is made says of which dtype, or is cast at once."""
+def test_no_number_depends_on_torchs_default_dtype_or_device_and_no_text_on_a_locale() -> None:
+    """These are the user's: every tensor that is made names its device, and its dtype or is cast at once."""
     assert [line for name in MODULES for line in about(name).told] == []
 
 

@@ -233,8 +233,8 @@ def _approximation(cfg: DictConfig, history: dict[str, Tensor], precise: bool) -
     _reproduced("estimate", staf(x.unsqueeze(0)).detach(), history["estimate"][-1:], precise)
     radius = float(problem.basis.centers.radius(x))
     generator = torch.Generator().manual_seed(0)
-    inside = torch.randn(_POINTS, len(x), dtype=torch.float64, generator=generator)
-    shrink = torch.rand(_POINTS, 1, dtype=torch.float64, generator=generator) ** (1 / len(x))
+    inside = torch.randn(_POINTS, len(x), dtype=torch.float64, generator=generator, device="cpu")
+    shrink = torch.rand(_POINTS, 1, dtype=torch.float64, generator=generator, device="cpu") ** (1 / len(x))
     points = x + radius * shrink * inside / inside.norm(dim=-1, keepdim=True)
     unit = getattr(problem.system, "units", Units())
     where = ", ".join(f"{v:.6g}" for v in x.tolist())
@@ -275,7 +275,9 @@ def _controller(
         _reproduced("control", last(states[-2:-1])[0], history["control"][-2], precise)
     low, high = states.amin(0), states.amax(0)
     generator = torch.Generator().manual_seed(0)
-    points = low + (high - low) * torch.rand(_POINTS, len(low), dtype=torch.float64, generator=generator)
+    points = low + (high - low) * torch.rand(
+        _POINTS, len(low), dtype=torch.float64, generator=generator, device="cpu"
+    )
     unit = problem.system.units
     box = " x ".join(f"[{a:.4g}, {b:.4g}]" for a, b in zip(low.tolist(), high.tolist(), strict=True))
     learned = f", {weights.shape[-1]} actor weights as they were at the end" if learns else ""

@@ -73,7 +73,7 @@ def _self_test() -> tuple[str, bool]:
     """Run the paper's chase for a second of its time and compare the excess at the end."""
     start = time.perf_counter()
     basis = StaFBasis(ExponentialKernel(), StateFollowingCenters(rings(6), radius=0.1))
-    x = torch.tensor([[1.0, 0.0]], dtype=torch.float64)
+    x = torch.tensor([[1.0, 0.0]], dtype=torch.float64, device="cpu")
     states = simulate(Oscillator(), x, dt=0.01, steps=100)
     found = float(chase(states, basis, Paper(), SteepestDescent(), inner_steps=10).excess[0, -1])
     good = abs(found - _EXPECTED) <= _TOLERANCE * _EXPECTED

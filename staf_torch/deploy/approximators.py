@@ -209,5 +209,5 @@ def _negligible(terms: list[Tensor], eps: float, reach: float) -> bool:
 
 def _derivative(c: Tensor) -> Tensor:
     """Coefficients of the derivative, padded: (P + 1, M) -> (P + 1, M)."""
-    power = torch.arange(1, len(c), dtype=c.dtype).unsqueeze(-1)
+    power = torch.arange(1, len(c), dtype=c.dtype, device=c.device).unsqueeze(-1)
     return torch.cat((power * c[1:], torch.zeros_like(c[:1])))

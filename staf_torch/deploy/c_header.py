@@ -206,7 +206,10 @@ def runner_c(path: Path, sizes: Sequence[int | None], dtype: torch.dtype) -> Run
     call = _built(path, f"void call(const {kind} *state, {declared}) {{ {_name(path)}(state, {names}); }}")
 
     def run(x: Tensor) -> tuple[Tensor, ...]:
-        outs = tuple(torch.empty(len(x), *([] if size is None else [size]), dtype=dtype) for size in sizes)
+        outs = tuple(
+            torch.empty(len(x), *([] if size is None else [size]), dtype=dtype, device=x.device)
+            for size in sizes
+        )
         for k in range(len(x)):
             call(*(ctypes.c_void_p(t[k].data_ptr()) for t in (x, *outs)))
         return outs
@@ -252,7 +255,7 @@ def time_c(path: Path, states: Tensor, outputs: Sequence[int]) -> Latency:
     body = f"struct timespec a, b; volatile double seen = 0; {declared} {loop}"
     given = f"const {kind} *x, double *us, long rows, long n"
     call = _built(path, f"void call({given}) {{ {body} }}", "#include <time.h>\n")
-    x, taken = states.contiguous(), torch.empty(len(states), dtype=torch.float64)
+    x, taken = states.contiguous(), torch.empty(len(states), dtype=torch.float64, device=states.device)
     call(*(ctypes.c_void_p(t.data_ptr()) for t in (x, taken)), *map(ctypes.c_long, x.shape))
     return Latency(len(x), float(taken.median()), float(taken.quantile(0.99)), float(taken.max()))
 

@@ -173,9 +173,9 @@ class FoldedRollout(nn.Module):
                 f"kernel; got {policy.basis}."
             )
         basis = policy.basis
-        zero = torch.zeros(basis.dim, dtype=torch.float64)
+        zero = torch.zeros(basis.dim, dtype=torch.float64, device="cpu")
         space = copy.deepcopy(basis).double().local(zero)
-        unit = space.fit(torch.eye(basis.count, dtype=torch.float64))  # a row a center
+        unit = space.fit(torch.eye(basis.count, dtype=torch.float64, device="cpu"))  # a row a center
         at = zero.expand(basis.count, 1, -1)
         value = space.evaluate(at, unit).squeeze(-1)
         slope = torch.func.grad(lambda z: space.evaluate(z, unit).sum())(at).squeeze(-2)  # (M, n)

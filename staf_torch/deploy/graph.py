@@ -122,7 +122,7 @@ def lift_numbers(graph: fx.GraphModule) -> fx.GraphModule:
         for at in inexact:
             name = f"number_{count}"
             count += 1
-            value = torch.tensor(arguments[at], dtype=dtype)
+            value = torch.tensor(arguments[at], dtype=dtype, device="cpu")
             graph.register_buffer(name, value)
             with graph.graph.inserting_before(node):
                 constant = graph.graph.get_attr(name)
@@ -134,4 +134,4 @@ def lift_numbers(graph: fx.GraphModule) -> fx.GraphModule:
 
 
 def _inexact(value: float) -> bool:
-    return math.isfinite(value) and torch.tensor(value, dtype=torch.float32).item() != value
+    return math.isfinite(value) and torch.tensor(value, dtype=torch.float32, device="cpu").item() != value

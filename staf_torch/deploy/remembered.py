@@ -53,10 +53,10 @@ class RememberedPolicy(nn.Module):
         self.problem = copy.deepcopy(problem)
         self.candidates, self.lookahead, self.worst = memory.candidates, memory.lookahead, memory.worst
         steps = length - self.lookahead - 1  # of a trajectory; all later rows are the goal
-        rows = torch.cat((memory.entries, torch.tensor([memory.resting], dtype=torch.int64)))
+        rows = torch.cat((memory.entries, torch.tensor([memory.resting], dtype=torch.int64, device="cpu")))
         which, time = rows // length, rows % length
         used, place = which.unique(return_inverse=True)
-        kept = used.unsqueeze(1) * length + torch.arange(steps + 1)
+        kept = used.unsqueeze(1) * length + torch.arange(steps + 1, device="cpu")
         ends = which * length + (time + self.lookahead).clamp(max=steps)
         models, end = ends.unique(return_inverse=True)
         self.region = hold(self, "region", memory.region.clone())
@@ -74,7 +74,7 @@ class RememberedPolicy(nn.Module):
         apart = (self.seen(x).unsqueeze(1) - self.searched).square().sum(-1)  # (B, S)
         near = apart.topk(self.candidates, largest=False).indices % states
         at = torch.cat((near, torch.full_like(near[:, :1], states)), dim=1).flatten()
-        ahead = self.first[at].unsqueeze(1) + torch.arange(self.lookahead)
+        ahead = self.first[at].unsqueeze(1) + torch.arange(self.lookahead, device="cpu")
         window = self.plans[torch.minimum(ahead, self.last[at].unsqueeze(1))]
         rows = x.unsqueeze(1).expand(-1, count, -1).flatten(0, 1)
         end = self.models[self.end[at]]

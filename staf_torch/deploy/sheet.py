@@ -112,7 +112,7 @@ def _count(value: Tensor) -> int:
 @Sign("timing the export")
 def latency(run: Callable[[Tensor], object], x: Tensor, calls: int = CALLS) -> Latency:
     """Time calls one by one with the input x (1, n), on one core where the system lets us choose."""
-    taken = torch.empty(calls, dtype=torch.float64)
+    taken = torch.empty(calls, dtype=torch.float64, device="cpu")
     with torch.no_grad(), _one_core():
         for _ in range(_WARM):
             run(x)

@@ -78,7 +78,7 @@ def _cart_pole() -> StepPlant:
 def _acrobot() -> StepPlant:
     # Links of 1 m and 1 kg, their centers of mass in the middle, each with an inertia of 1 kg m^2.
     gravity, dt = 9.8, 0.2
-    fastest = torch.tensor([4 * math.pi, 9 * math.pi], dtype=torch.float64)  # rad/s
+    fastest = torch.tensor([4 * math.pi, 9 * math.pi], dtype=torch.float64, device="cpu")  # rad/s
 
     def rate(x: Tensor, u: Tensor) -> Tensor:
         first, second, turn1, turn2 = x.unbind(-1)

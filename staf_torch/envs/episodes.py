@@ -77,7 +77,7 @@ def to_control(action: Numbers | Tensor, shape: tuple[int, ...], bounds: Bounds)
     Raises:
         ValueError: if it has another shape or leaves the bound: nothing is clipped behind your back.
     """
-    u = torch.as_tensor(action).detach().to("cpu", torch.float64)
+    u = torch.as_tensor(action, device=getattr(action, "device", "cpu")).detach().to("cpu", torch.float64)
     if u.shape != shape:
         raise fail("step", "action", f"must have the shape {shape}", tuple(u.shape))
     if not bool(bounds.contain(u).all()):
@@ -101,7 +101,7 @@ def start(
     stated = None if options is None else options.get("state")
     if stated is None:
         return torch.stack([torch.from_numpy(g.uniform(-spread, spread, dim)) for g in generators])
-    states = torch.as_tensor(stated).to("cpu", torch.float64)
+    states = torch.as_tensor(stated, device=getattr(stated, "device", "cpu")).to("cpu", torch.float64)
     if states.dim() == 1:
         states = states.expand(len(generators), -1)
     if states.shape != (len(generators), dim) or not bool(torch.isfinite(states).all()):
@@ -166,7 +166,7 @@ class Episodes:
         self.steps = math.ceil(horizon / self.loop.dt - 1e-9)
         self.penalty = positive_real("Episodes", "penalty", penalty)
         self.state = cost.q.new_zeros(rows, cost.dim)
-        self.age = torch.zeros(rows, dtype=torch.int64)
+        self.age = torch.zeros(rows, dtype=torch.int64, device="cpu")
 
     def begin(self, rows: Tensor, x0: Tensor) -> None:
         """New episodes in the rows of a mask (B,), from x0 (B, n)."""
@@ -243,7 +243,7 @@ class Agent:
         """u, or the action that stands for it: (n,) -> (m,), or (B, n) -> (B, m) with the same B until the
         next `begin`."""
         shown = observation if self.state is None else self.state(np.asarray(observation))
-        seen = torch.as_tensor(shown).to("cpu", torch.float64)
+        seen = torch.as_tensor(shown, device=getattr(shown, "device", "cpu")).to("cpu", torch.float64)
         x = seen.reshape(-1, seen.shape[-1])
         with torch.no_grad():
             if self._carried is None:

@@ -87,7 +87,7 @@ class PlantEnv(gymnasium.Env):
         """A new episode: its first observation."""
         super().reset(seed=seed)
         x0 = start(options, [self.np_random], self.spread, self.episodes.state.shape[1])
-        self.episodes.begin(torch.ones(1, dtype=torch.bool), x0)
+        self.episodes.begin(torch.ones(1, dtype=torch.bool, device="cpu"), x0)
         return self._observation(), {}
 
     def step(self, action: Numbers | Tensor) -> tuple[Numbers, float, bool, bool, dict[str, Any]]:
@@ -159,7 +159,7 @@ class PlantVectorEnv(VectorEnv):
             "PlantVectorEnv", "spread", self.plant.spread if spread is None else spread
         )
         self._generators: list[np.random.Generator] = []
-        self._over = torch.zeros(num_envs, dtype=torch.bool)
+        self._over = torch.zeros(num_envs, dtype=torch.bool, device="cpu")
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -170,7 +170,11 @@ class PlantVectorEnv(VectorEnv):
             seeds = seed if isinstance(seed, list) else [None if seed is None else seed + k for k in count]
             self._generators = [gymnasium.utils.seeding.np_random(one)[0] for one in seeds]
         mask = None if options is None else options.get("reset_mask")
-        rows = torch.ones_like(self._over) if mask is None else torch.as_tensor(mask, dtype=torch.bool)
+        rows = (
+            torch.ones_like(self._over)
+            if mask is None
+            else torch.as_tensor(mask, dtype=torch.bool, device=getattr(mask, "device", "cpu"))
+        )
         self._begin(rows, options)
         return self._observation(), {}
 

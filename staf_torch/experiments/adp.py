@@ -202,7 +202,7 @@ def _stacked(controllers: Sequence[Controller], rows: Sequence[int]) -> Controll
     if target is None:
         return stacked
     given = [one for each in controllers if (one := learner(each)) is not None]
-    counts = torch.tensor(rows, dtype=torch.int64)
+    counts = torch.tensor(rows, dtype=torch.int64, device="cpu")
     for name in ("critic", "actor", "gain"):
         values = torch.stack([getattr(one, name) for one in given])
         setattr(target, name, values.repeat_interleave(counts.to(values.device), dim=0))
@@ -214,7 +214,7 @@ def _gains(gains: Sequence[Gains], counts: Tensor, like: Tensor) -> Gains:
     """Numbers where all agree, else (B, 1) of the dtype and on the device of ``like``."""
 
     def joined(values: list[float]) -> float | Tensor:
-        rows = torch.tensor(values, dtype=torch.float64).repeat_interleave(counts).to(like)
+        rows = torch.tensor(values, dtype=torch.float64, device="cpu").repeat_interleave(counts).to(like)
         return values[0] if len(set(values)) == 1 else rows.unsqueeze(-1)
 
     names = [field.name for field in dataclasses.fields(Gains)]

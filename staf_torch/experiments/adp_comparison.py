@@ -166,7 +166,7 @@ def _from_weights(problem: AdpProblem, weights: list[float], actor: float) -> Ad
     """Every initial state once with every weight, one batch."""
     x0, learning = problem.initial_states, learner(problem.controller)
     assert learning is not None
-    critic: Tensor = torch.tensor(weights).to(x0).repeat_interleave(len(x0)).unsqueeze(-1)
+    critic: Tensor = torch.tensor(weights, device="cpu").to(x0).repeat_interleave(len(x0)).unsqueeze(-1)
     learning.critic = critic.expand(-1, learning.basis.count)
     learning.actor = actor * learning.critic
     return problem.with_states(x0.repeat(len(weights), 1))

@@ -89,7 +89,7 @@ def _optimal_cost(plant: TwoStateTracking, cost: QuadraticCost, x0: Tensor) -> T
 
 def _controllers(cfg: DictConfig, plant: TwoStateTracking, cost: QuadraticCost) -> dict[str, Controller]:
     chosen = cfg.adp.identification
-    theta = torch.tensor(plain(chosen.theta), dtype=torch.float64)
+    theta = torch.tensor(plain(chosen.theta), dtype=torch.float64, device="cpu")
     # 1e-300 keeps the first estimate: the same code without learning.
     learning = ConcurrentLearning(3, 2, chosen.size, chosen.gain)
     frozen = ConcurrentLearning(3, 2, chosen.size, 1e-300)

@@ -45,7 +45,10 @@ class Vehicle(NamedTuple):
 
 def _mass(cfg: DictConfig, dt: float, bound: float) -> Vehicle:
     """p'' = u under its LQR."""
-    matrix, push = torch.zeros(4, 4, dtype=torch.float64), torch.zeros(4, 2, dtype=torch.float64)
+    matrix, push = (
+        torch.zeros(4, 4, dtype=torch.float64, device="cpu"),
+        torch.zeros(4, 2, dtype=torch.float64, device="cpu"),
+    )
     matrix[0, 2] = matrix[1, 3] = push[2, 0] = push[3, 1] = 1.0
     cost = QuadraticCost(cfg.adp.q, cfg.adp.r, 4, 2, low=-bound, high=bound)
     lqr = LQR(Linear(matrix.tolist(), push.tolist()), cost, period=dt)
@@ -216,13 +219,15 @@ def scenarios(cfg: DictConfig) -> Tensor:
 
     def at_rest() -> Tensor:
         if not turns:
-            return torch.zeros(2, dtype=torch.float64)
-        return 2 * math.pi * torch.rand(1, dtype=torch.float64, generator=generator)
+            return torch.zeros(2, dtype=torch.float64, device="cpu")
+        return 2 * math.pi * torch.rand(1, dtype=torch.float64, generator=generator, device="cpu")
 
-    reach = torch.tensor([_HALF_WIDTH] * 2 + [speed] * 2, dtype=torch.float64)
+    reach = torch.tensor([_HALF_WIDTH] * 2 + [speed] * 2, dtype=torch.float64, device="cpu")
     found: list[Tensor] = []
     for _ in range(_DRAWS * count):
-        angle, numbers = (torch.rand(n, dtype=torch.float64, generator=generator) for n in (1, 4 * discs))
+        angle, numbers = (
+            torch.rand(n, dtype=torch.float64, generator=generator, device="cpu") for n in (1, 4 * discs)
+        )
         start = away * torch.cat(((2 * math.pi * angle).cos(), (2 * math.pi * angle).sin()))
         moving = (2 * numbers - 1).reshape(discs, 4) * reach
         if float((moving[:, :2] - start).norm(dim=-1).min()) > clear:

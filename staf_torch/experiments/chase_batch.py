@@ -164,7 +164,7 @@ class _BatchMember:
         self.rows = len(problem.initial_states)
         self._thinned = _Thinned(problem.steps + 1) if drawn else None
         self._warnings: list[str] = []
-        self._diverged_at = torch.full((self.rows,), -1, dtype=torch.int64)
+        self._diverged_at = torch.full((self.rows,), -1, dtype=torch.int64, device="cpu")
 
     def take(self, result: ChaseResult, rows: slice, place: int, *, alone: bool) -> None:
         """Take in ``rows`` of a piece of time, which are this problem's from ``place`` on."""

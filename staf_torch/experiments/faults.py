@@ -82,8 +82,8 @@ def short_period(rows: int, generator: torch.Generator) -> FaultCase:
 
     Source: Deptula, Bell, Zegers, Licitra and Dixon, Automatica 116 (2020), 108922.
     """
-    drift = torch.tensor([-1.175, 0.9871, -8.458, -0.8776], dtype=torch.float64)
-    pushed = torch.tensor([[-0.194, -0.03593], [-19.29, -3.803]], dtype=torch.float64)
+    drift = torch.tensor([-1.175, 0.9871, -8.458, -0.8776], dtype=torch.float64, device="cpu")
+    pushed = torch.tensor([[-0.194, -0.03593], [-19.29, -3.803]], dtype=torch.float64, device="cpu")
 
     def regressor(x: Tensor, u: Tensor) -> Tensor:
         none = torch.zeros_like(x)
@@ -91,12 +91,12 @@ def short_period(rows: int, generator: torch.Generator) -> FaultCase:
         first, second = torch.cat((x, none), -1), torch.cat((none, x), -1)
         return torch.cat((torch.stack((first, second), dim=-2), effect), dim=-1)
 
-    true = torch.cat((drift, torch.tensor([0.7, 0.0], dtype=torch.float64)))
+    true = torch.cat((drift, torch.tensor([0.7, 0.0], dtype=torch.float64, device="cpu")))
     model = ParametricPlant(regressor, dim=2, inputs=2, theta=true)
     cost = adp.BoundedInputCost(0.25, 5.0, dim=2, inputs=2, bound=2.0)
-    x0 = torch.tensor([[25.0, -10.0]], dtype=torch.float64).repeat(rows, 1)
-    first = torch.ones(rows, 6, dtype=torch.float64)
-    first[:, :4] = 10 * torch.rand(rows, 4, generator=generator, dtype=torch.float64) - 5
+    x0 = torch.tensor([[25.0, -10.0]], dtype=torch.float64, device="cpu").repeat(rows, 1)
+    first = torch.ones(rows, 6, dtype=torch.float64, device="cpu")
+    first[:, :4] = 10 * torch.rand(rows, 4, generator=generator, dtype=torch.float64, device="cpu") - 5
     law = LeastSquares([0.0] * 4 + [1.0] * 2, deviation=[10.0] * 4 + [1.0] * 2, floor=1e-5)
     # The plant is stable: where nothing is known, nothing is done but to probe.
     adaptive = AdaptiveLQR(
@@ -114,7 +114,7 @@ def unstable(rows: int, generator: torch.Generator) -> FaultCase:
     the origin, between 0.1 and 0.5 s. An LQR that is made to be held for that long does not stand it."""
 
     def regressor(x: Tensor, u: Tensor) -> Tensor:
-        effect = u * torch.tensor([1.0, 0.1], dtype=torch.float64).to(u)
+        effect = u * torch.tensor([1.0, 0.1], dtype=torch.float64, device="cpu").to(u)
         return torch.stack((torch.zeros_like(effect), effect), dim=-2)
 
     def known(x: Tensor, u: Tensor) -> Tensor:
@@ -122,13 +122,23 @@ def unstable(rows: int, generator: torch.Generator) -> FaultCase:
 
     model = ParametricPlant(regressor, known, dim=2, inputs=2, theta=[1.0, 1.0], rows=[1])
     cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=2)
-    x0 = 2 * torch.rand(rows, 2, generator=generator, dtype=torch.float64) - 1
-    at = 0.1 + 0.4 * torch.rand(rows, generator=generator, dtype=torch.float64)
+    x0 = 2 * torch.rand(rows, 2, generator=generator, dtype=torch.float64, device="cpu") - 1
+    at = 0.1 + 0.4 * torch.rand(rows, generator=generator, dtype=torch.float64, device="cpu")
     law = LeastSquares([1.0, 1.0], deviation=[0.3, 0.05], floor=1e-3, forgetting=0.2, alarm=5.0)
     windows = IntegralWindows(model, 0.06, noise=0.002)
-    before = torch.ones(rows, 2, dtype=torch.float64)
+    before = torch.ones(rows, 2, dtype=torch.float64, device="cpu")
     return FaultCase(
-        *(model, cost, x0, before, before * torch.tensor([0.5, 1.0]).to(before), at, 0.02, 0.002, 0.05),
+        *(
+            model,
+            cost,
+            x0,
+            before,
+            before * torch.tensor([0.5, 1.0], device="cpu").to(before),
+            at,
+            0.02,
+            0.002,
+            0.05,
+        ),
         AdaptiveLQR(model, cost, windows, law),
         lambda: None,
     )
@@ -145,20 +155,22 @@ def mass(rows: int, generator: torch.Generator) -> FaultCase:
 
     model = ParametricPlant(regressor, known, dim=2, inputs=1, theta=[1.0], rows=[1])
     cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
-    drawn = torch.rand(rows, 2, generator=generator, dtype=torch.float64)
-    side = torch.where(torch.rand(rows, dtype=torch.float32, generator=generator) < 0.5, -1.0, 1.0)
+    drawn = torch.rand(rows, 2, generator=generator, dtype=torch.float64, device="cpu")
+    side = torch.where(
+        torch.rand(rows, dtype=torch.float32, generator=generator, device="cpu") < 0.5, -1.0, 1.0
+    )
     x0 = torch.stack((side * (0.5 + drawn[:, 0]), 2 * drawn[:, 1] - 1), dim=-1)
-    true = torch.where(torch.arange(rows) % 2 == 0, 2.0, 0.5).double().unsqueeze(-1)  # 1 / mass
+    true = torch.where(torch.arange(rows, device="cpu") % 2 == 0, 2.0, 0.5).double().unsqueeze(-1)  # 1 / mass
     law = LeastSquares([1.0], deviation=1.0, floor=1e-4)
     windows = IntegralWindows(model, 0.3, shape="smooth", first=0.013, noise=0.01)
     # Between the masses that are possible: too much push is dearer than too little, for so short a time.
-    robust = LQR(model.believing(torch.tensor([1.15], dtype=torch.float64)), cost)
+    robust = LQR(model.believing(torch.tensor([1.15], dtype=torch.float64, device="cpu")), cost)
     # Noise times a gain of 40 costs 1.7 in 10 s, where the cheapest starts cost 9.
     filter = adp.ConsiderFilter(model, noise=0.01, process=0.01)
     adaptive = AdaptiveLQR(model, cost, windows, law, robust=robust, confidence=2.0, filter=filter)
 
     def optimum() -> Tensor:
-        best = torch.full((rows,), torch.nan, dtype=torch.float64)
+        best = torch.full((rows,), torch.nan, dtype=torch.float64, device="cpu")
         for inverse in true.unique():
             same = true[:, 0] == inverse
             shooting = adp.DirectShooting(model.believing(inverse.unsqueeze(0)), cost)

@@ -46,8 +46,8 @@ Method = Callable[[StaFBasis, Target, Tensor, Tensor], Tensor]
 def cholesky(basis: StaFBasis, target: Target, x: Tensor, z: Tensor, jitter: float = 0.0) -> Tensor:
     """K0 + jitter I = L L' and two triangular solves."""
     structure = basis.gram_structure(x)
-    scale = torch.ones(()).to(x) if structure.scale is None else structure.scale
-    identity = torch.eye(basis.count, dtype=x.dtype)
+    scale = torch.ones((), device="cpu").to(x) if structure.scale is None else structure.scale
+    identity = torch.eye(basis.count, dtype=x.dtype, device=x.device)
     factor, info = torch.linalg.cholesky_ex(structure.core + jitter * identity)
     right = basis.values(x, target) / scale
     b = torch.cholesky_solve(right.unsqueeze(-1), factor).squeeze(-1)
@@ -275,7 +275,7 @@ def _radii(cfg: DictConfig, per_decade: int) -> list[float]:
         raise fail(COMMAND_LINE, "flat_limit.radii.smallest", rule, smallest)
     steps = math.floor(per_decade * math.log10(largest / smallest) * (1 - 1e-9))
     grid = [smallest * 10 ** (k / per_decade) for k in range(steps + 1)]
-    return torch.tensor([*grid, largest], dtype=torch.float32).tolist()
+    return torch.tensor([*grid, largest], dtype=torch.float32, device="cpu").tolist()
 
 
 def _shown(problem: FlatLimit, samples: list[FlatLimitErrors]) -> Table:

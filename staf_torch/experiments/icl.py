@@ -98,7 +98,7 @@ def _followed(cfg: DictConfig, plant: ParametricPlant, gains: dict[str, Tensor],
         QuadraticCost(1.0, 1.0, 5, 2, output=lambda z: z[..., :2] - reference(z)[0]),
     )
     result = method.run(
-        torch.tensor([start], dtype=torch.float64).repeat(len(gains["rate"]), 1),
+        torch.tensor([start], dtype=torch.float64, device="cpu").repeat(len(gains["rate"]), 1),
         dt=dt,
         seed=seed_of(cfg),
         **recorded_times(duration, dt, min(_RECORDED, duration / 20)),
@@ -143,7 +143,7 @@ def _gains(cfg: DictConfig) -> dict[str, Tensor]:
     """Gains of every row, uniform in their ranges."""
     rows = integer(COMMAND_LINE, "trajectories", cfg.trajectories, least=1)
     generator = generator_of(cfg)
-    drawn = torch.rand(rows, 4, generator=generator, dtype=torch.float64)
+    drawn = torch.rand(rows, 4, generator=generator, dtype=torch.float64, device="cpu")
     found = {}
     for k, name in enumerate(("feedback", "gain", "rate", "length")):
         low, high = vector(COMMAND_LINE, f"icl.{name}", plain(cfg.icl[name]), 2)

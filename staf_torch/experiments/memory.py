@@ -66,7 +66,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     found = _chase(problem, states)
     coefficients = problem.basis.local(states).coefficients(found.weights)
     memory = remember(problem, settings, states[:, first:], coefficients[:, first:], progress)
-    index = first + (torch.arange(settings.states) * (problem.steps - first)) // settings.states
+    index = first + (torch.arange(settings.states, device="cpu") * (problem.steps - first)) // settings.states
     region = errors(problem, memory, states, coefficients, index.unique())
     again = revisits(problem, settings, memory, found, first)
     metrics = summary(memory, region, again)
@@ -128,7 +128,9 @@ def revisits(
     """The state returns to earlier ones: a chase from the memory's weights, from the last ones, from none."""
     times = found.state.shape[1]
     steps = min(settings.steps, times - first)
-    at = first + (torch.arange(settings.revisits) * (times - first - steps)) // settings.revisits
+    at = (
+        first + (torch.arange(settings.revisits, device="cpu") * (times - first - steps)) // settings.revisits
+    )
     pieces = torch.stack([found.state[:, k : k + steps] for k in at.tolist()], dim=1)  # (B, R, S, n)
     x = pieces[:, :, 0]
     weights = problem.basis.local(x).weights(memory.start(x))

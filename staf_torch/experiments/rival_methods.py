@@ -97,7 +97,7 @@ def steered(case: RivalPlant, mpc: adp.Controller) -> Begin:
         def steer(x: Tensor) -> Tensor:
             nonlocal state
             shape = (*x.shape[:1], mpc.draws, x.shape[1])
-            uniform = 2 * torch.rand(shape, generator=drawn, dtype=x.dtype) - 1
+            uniform = 2 * torch.rand(shape, generator=drawn, dtype=x.dtype, device="cpu") - 1
             u, state = mpc.step(x, state, uniform, case.dt)
             return u
 

@@ -73,8 +73,8 @@ class RivalPlant:
     def goal(self) -> Tensor:
         """The set-point, or the path at t = 0, (n,)."""
         if self.path is not None:
-            return self.way(torch.zeros((), dtype=torch.float64))
-        return torch.tensor(self.target or [0.0] * self.dim, dtype=torch.float64)
+            return self.way(torch.zeros((), dtype=torch.float64, device="cpu"))
+        return torch.tensor(self.target or [0.0] * self.dim, dtype=torch.float64, device="cpu")
 
     def way(self, time: Tensor) -> Tensor:
         """The path: (...) -> (..., n)."""
@@ -99,7 +99,7 @@ class RivalPlant:
         return plant if self.path is None else Clocked(plant)
 
     def cost(self) -> QuadraticCost:
-        q, r = (torch.diag(torch.tensor(part, dtype=torch.float64)) for part in self.weights)
+        q, r = (torch.diag(torch.tensor(part, dtype=torch.float64, device="cpu")) for part in self.weights)
         if self.path is not None:
             return TrackingCost(q, r, self.dim, self.inputs, path=self.way)
         return QuadraticCost(q, r, self.dim, self.inputs, target=self.target)
@@ -110,8 +110,8 @@ class RivalPlant:
     def states(self, count: int, seed: int) -> Tensor:
         """Initial states, uniform in the box, with the time where there is a path: (count, n or n + 1)."""
         generator = torch.Generator().manual_seed(seed)
-        uniform = torch.rand(count, self.dim, generator=generator, dtype=torch.float64)
-        x = self.goal() + torch.tensor(self.box, dtype=torch.float64) * (2 * uniform - 1)
+        uniform = torch.rand(count, self.dim, generator=generator, dtype=torch.float64, device="cpu")
+        x = self.goal() + torch.tensor(self.box, dtype=torch.float64, device="cpu") * (2 * uniform - 1)
         return x if self.path is None else torch.cat((x, torch.zeros_like(x[:, :1])), dim=-1)
 
 

@@ -189,7 +189,7 @@ def _by_ipopt(
         guess = np.concatenate([state[row, :, : case.dim].numpy().ravel(), control[row].numpy().ravel()])
         solved = solve(x0=guess, p=np.append(x0[row, : case.dim].numpy(), 0.0))
         found.append(float(solved["f"]) if solved["success"] else np.inf)
-    return torch.tensor(found, dtype=torch.float64)
+    return torch.tensor(found, dtype=torch.float64, device="cpu")
 
 
 def _measured(episode: Episode | None, best: Tensor, share: float) -> Metrics:

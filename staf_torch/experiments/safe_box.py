@@ -136,7 +136,7 @@ def _unavoidable(cfg: DictConfig, box: Barrier, cost: Cost, starts: dict[str, Te
 def _anywhere(cfg: DictConfig, box: Barrier) -> Tensor:
     """States drawn uniformly from the box, from [-1, 1] around its middle where a wall is missing: (B, n)."""
     count = integer(COMMAND_LINE, "safe_box.states", cfg.safe_box.states, least=1)
-    share = torch.rand(count, len(box.low), dtype=torch.float64, generator=generator_of(cfg))
+    share = torch.rand(count, len(box.low), dtype=torch.float64, generator=generator_of(cfg), device="cpu")
     return (box.floor + (box.ceiling - box.floor) * share).clamp(box.low + 1e-9, box.high - 1e-9)
 
 
@@ -145,7 +145,7 @@ def _beside_walls(cfg: DictConfig, box: Barrier) -> Tensor:
     near = positive_real(COMMAND_LINE, "safe_box.near", cfg.safe_box.near)
     x = _anywhere(cfg, box)
     walls = [(k, side) for k in range(len(box.low)) for side in (0, 1) if bool(box.walled[side, k])]
-    chosen = torch.randint(len(walls), (len(x),), generator=generator_of(cfg)).to(x.device)
+    chosen = torch.randint(len(walls), (len(x),), generator=generator_of(cfg), device="cpu").to(x.device)
     for number, (k, side) in enumerate(walls):
         beside = box.high[k] - near if side else box.low[k] + near
         x[:, k] = torch.where(chosen == number, beside, x[:, k])

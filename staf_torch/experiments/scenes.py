@@ -55,9 +55,9 @@ def chase_scene(problem: ChaseProblem, drawn: Mapping[str, np.ndarray]) -> Scene
     """Return the first trajectory of a chase, thinned, as `Outcome.drawn` has it."""
     at = frames(len(drawn["time"]) - 1)
     like = problem.initial_states
-    x, weights = (torch.as_tensor(drawn[name][at]).to(like) for name in ("state", "weights"))
+    x, weights = (torch.as_tensor(drawn[name][at], device="cpu").to(like) for name in ("state", "weights"))
     radius = problem.basis.centers.radius(x).expand(len(at))
-    along, points = _across(torch.as_tensor(drawn["state"]).to(like), at, radius)
+    along, points = _across(torch.as_tensor(drawn["state"], device="cpu").to(like), at, radius)
     with torch.no_grad():
         estimate = (problem.basis(points, x) * weights[:, None]).sum(-1)
         centers = problem.basis.centers(x)[..., :2]
@@ -191,12 +191,12 @@ def _across(path: Tensor, at: np.ndarray, radius: Tensor) -> tuple[Tensor, Tenso
     """Return places from -1 to 1 (S,), and the points there (F, S, n): along the way through each ball."""
     way = torch.gradient(path, dim=0)[0][at]
     way = way / way.norm(dim=-1, keepdim=True).clamp_min(torch.finfo(path.dtype).tiny)
-    along = torch.linspace(-1, 1, _ACROSS).to(path)
+    along = torch.linspace(-1, 1, _ACROSS, device="cpu").to(path)
     return along, path[at][:, None] + (radius[:, None] * along)[..., None] * way[:, None]
 
 
 def _levels(value: Value, reach: float, like: Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    line = torch.linspace(-reach, reach, _GRID).to(like)
+    line = torch.linspace(-reach, reach, _GRID, device="cpu").to(like)
     plane = torch.stack(torch.meshgrid(line, line, indexing="xy"), dim=-1)
     level = value(plane.reshape(-1, 2)).reshape(_GRID, _GRID)
     return _array(line), _array(line), _array(level)

@@ -171,8 +171,8 @@ def needed_centers(
             for radius in progress.each(radii, "radii")
         ]
     ).cpu()
-    counts = torch.tensor([len(layout) for layout in layouts], dtype=torch.int64)
-    allowed = torch.tensor(epsilons, dtype=errors.dtype)
+    counts = torch.tensor([len(layout) for layout in layouts], dtype=torch.int64, device="cpu")
+    allowed = torch.tensor(epsilons, dtype=errors.dtype, device=errors.device)
     good = errors.unsqueeze(1) <= allowed[:, None, None]  # (R, E, L, T)
     return Needed(counts, errors, _first(good.mT, counts), _first(good.all(-1), counts))
 

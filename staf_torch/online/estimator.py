@@ -380,7 +380,7 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
 
     def _drop(self, streams: Any) -> None:
         gone = self._numbers("drop", streams)
-        every = torch.arange(self._streams_.count)
+        every = torch.arange(self._streams_.count, device="cpu")
         rows = every[~torch.isin(every, gone)]
         if self.n_streams_ is None or not len(rows):
             raise fail(self._call("drop"), "streams", "must leave a stream", streams)
@@ -460,7 +460,7 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
                 told = f"must be of a regressor with the same arguments: it has {key}={its}, this one {mine}"
                 raise ValueError(f"`{name}(state=...)` {told}.")
         leading = () if streams is None else (streams,)
-        x = torch.zeros(*leading, state["n_features_in_"], dtype=dtype)
+        x = torch.zeros(*leading, state["n_features_in_"], dtype=dtype, device="cpu")
         twin._prepare(x, x.new_zeros((*leading, *(() if outputs is None else (outputs,)))))
         twin._streams_.load_state_dict(state)
         self._change(self._take_over, twin, state)
@@ -483,7 +483,7 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
 
     def _numbers(self, call: str, streams: Any) -> Tensor:
         """Return the numbers of streams, (R,) int64."""
-        found = torch.as_tensor(np.asarray(streams)).reshape(-1)
+        found = torch.as_tensor(np.asarray(streams), device="cpu").reshape(-1)
         most = self._fitted(call)._streams_.count
         found = found.long() if found.numel() == 0 else found  # an empty list is of floats
         wrong = found.is_floating_point() or found.dtype == torch.bool

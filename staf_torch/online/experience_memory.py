@@ -85,12 +85,18 @@ class ExperienceMemory(nn.Module):
         like = basis.centers.directions
         self.states = hold(self, "states", like.new_zeros(*batch_shape, capacity, basis.dim))
         self.coefficients = hold(self, "coefficients", like.new_zeros(*batch_shape, capacity, basis.count))
-        self.stored = hold(self, "stored", torch.zeros(*batch_shape, capacity, dtype=torch.bool))
-        self.latest = hold(self, "latest", torch.full(batch_shape, -1, dtype=torch.int64))  # written last
+        self.stored = hold(
+            self, "stored", torch.zeros(*batch_shape, capacity, dtype=torch.bool, device="cpu")
+        )
+        self.latest = hold(
+            self, "latest", torch.full(batch_shape, -1, dtype=torch.int64, device="cpu")
+        )  # written last
         self.origin = hold(
             self, "origin", like.new_zeros(*batch_shape, basis.dim)
         )  # where it was first stored
-        self.averaged = hold(self, "averaged", torch.zeros(*batch_shape, capacity, dtype=torch.int64))
+        self.averaged = hold(
+            self, "averaged", torch.zeros(*batch_shape, capacity, dtype=torch.int64, device="cpu")
+        )
         self.scatter = hold(self, "scatter", like.new_zeros(*batch_shape, capacity))  # usual distance
 
     @property

@@ -48,17 +48,17 @@ class FilterStreams:
         self._known = torch.full_like(self.units, torch.nan) if units is None else units.double()
         self.first = like.new_zeros(size, LEARNED_AT[-1] if scaling else 0, wide + 1)  # samples and lapses
         # Of first samples; behind them, of far ones in a row. Then the place of the oldest of the latest.
-        self.clock, self.turn = (torch.zeros(size, dtype=torch.int64) for _ in range(2))
+        self.clock, self.turn = (torch.zeros(size, dtype=torch.int64, device="cpu") for _ in range(2))
         grows = self.units.new_full((size, state.dim), float(units is None))
         self._may_grow = grows if may_grow is None else may_grow.double()
-        self._begin(torch.arange(size))
+        self._begin(torch.arange(size, device="cpu"))
         self._hold(definition, state)
 
     def _begin(self, rows: Tensor) -> None:
         """Streams with these numbers know no units but those that they were given."""
         wide, known = self.units.shape[1] // 2, self._known[rows]
         given = known.isfinite().all(1)
-        unit = torch.arange(2 * wide) >= wide
+        unit = torch.arange(2 * wide, device="cpu") >= wide
         self.units[rows] = torch.where(given[:, None], known, unit.double())
         self.clock[rows] = torch.where(given, LEARNED_AT[-1], 0)
         self.first[rows] = 0.0
@@ -150,7 +150,7 @@ class FilterStreams:
         usable = seen[:, :n].any(1) & seen[:, n:].any(1) & ~both.isinf().any(1)
         young = self.clock < kept
         place = torch.where(young, self.clock, self.turn)
-        every = torch.arange(len(place))
+        every = torch.arange(len(place), device="cpu")
         lapses = torch.ones_like(both[:, 0]) if lapse is None else lapse
         waited = torch.where(young, self.first[every, place, -1], 0.0)  # since the last usable one
         self.first[every, place, -1] = waited + lapses
@@ -158,7 +158,13 @@ class FilterStreams:
         self.first[rows, place[rows], :-1] = both[rows]
         self.turn = torch.where(usable & ~young, (self.turn + 1) % kept, self.turn)
         self.clock += usable & young
-        return usable & young & torch.isin(self.clock, torch.tensor(LEARNED_AT, dtype=self.clock.dtype))
+        return (
+            usable
+            & young
+            & torch.isin(
+                self.clock, torch.tensor(LEARNED_AT, dtype=self.clock.dtype, device=self.clock.device)
+            )
+        )
 
     def _grow(self) -> None:
         """Give a coordinate that moves by far more than its unit a larger one, and learn the latest again."""
@@ -183,7 +189,7 @@ class FilterStreams:
             return
         rows = rows[some]
         self.units[rows, wide : wide + n] = torch.where(grown, moves, unit)[some]
-        order = (self.turn[rows, None] + torch.arange(LEARNED_AT[-1])) % LEARNED_AT[-1]
+        order = (self.turn[rows, None] + torch.arange(LEARNED_AT[-1], device="cpu")) % LEARNED_AT[-1]
         self._relearn(rows, self.first[rows[:, None], order])
 
     def _leave(self, x: Tensor, both: Tensor) -> None:
@@ -266,7 +272,7 @@ class FilterStreams:
         self.first = torch.cat((self.first, self.first.new_zeros(streams, *self.first.shape[1:])))
         self.clock, self.turn = (torch.cat((a, a.new_zeros(streams))) for a in (self.clock, self.turn))
         self._may_grow, self._stretch = (_joined(a, streams) for a in (self._may_grow, self._stretch))
-        self._begin(torch.arange(self.count, self.count + streams))
+        self._begin(torch.arange(self.count, self.count + streams, device="cpu"))
         law = (_joined(a, streams) for a in (self.definition.ratio, self.definition.forgetting))
         self._hold(self.definition.with_law(*law), state)
 
@@ -306,7 +312,12 @@ class FilterStreams:
         for name, own in self._fixed().items():
             given = state.get(name)
             like = isinstance(given, Tensor) and given.shape == own.shape and given.dtype == own.dtype
-            if not (like and torch.allclose(torch.as_tensor(given), own, rtol=1e-9)):
+            if not (
+                like
+                and torch.allclose(
+                    torch.as_tensor(given, device=getattr(given, "device", "cpu")), own, rtol=1e-9
+                )
+            ):
                 told = "must have the kernel, radius and centers of this regressor"
                 raise ValueError(f"`load_state_dict(state=...)` {told}; {name!r} differs.")
         kept = self.state.with_table(state["table"], state["counts"].clone())

@@ -168,7 +168,11 @@ class StaFRegressor(StreamEstimator):
         streams = twin._streams_.inner if isinstance(twin._streams_, TurningStreams) else twin._streams_
         assert isinstance(streams, FilterStreams)
         rows = (len(states), streams.count, -1)
-        whole = torch.ones(rows[:2], dtype=torch.float64) if steps is None else steps.expand(rows[:2])
+        whole = (
+            torch.ones(rows[:2], dtype=torch.float64, device="cpu")
+            if steps is None
+            else steps.expand(rows[:2])
+        )
         both = torch.cat((states.double().reshape(rows), values.double().reshape(rows)), -1)
         n, (center, spread) = states.shape[-1], streams.units_for(both)
         units = (both - center) / spread

@@ -62,7 +62,7 @@ class RiverRegressor:
                 f"which are left out: give all of them from the first sample on",
                 stacklevel=2,
             )
-        self.model.partial_fit(self._row(x), torch.tensor(_number(y), dtype=torch.float64))
+        self.model.partial_fit(self._row(x), torch.tensor(_number(y), dtype=torch.float64, device="cpu"))
         return self
 
     def predict_one(self, x: Mapping[Any, float | None], **kwargs: Any) -> float:
@@ -70,7 +70,9 @@ class RiverRegressor:
         return float(self.model.predict(self._row(x))) if self.features else 0.0
 
     def _row(self, x: Mapping[Any, float | None]) -> torch.Tensor:
-        return torch.tensor([_number(x.get(name)) for name in self.features], dtype=torch.float64)
+        return torch.tensor(
+            [_number(x.get(name)) for name in self.features], dtype=torch.float64, device="cpu"
+        )
 
 
 def _number(value: float | None) -> float:

@@ -26,7 +26,7 @@ def tensor_of(call: str, name: str, value: Any) -> Tensor:
                 array = array.astype(float)
             if np.iscomplexobj(array):
                 raise ValueError("Complex data not supported")
-            found = torch.as_tensor(array if array.flags.writeable else array.copy())
+            found = torch.from_numpy(array if array.flags.writeable else array.copy())
         except (TypeError, ValueError, RuntimeError) as error:
             kind = TypeError if hasattr(value, "toarray") or "convert" not in str(error) else ValueError
             kind = ValueError if isinstance(error, ValueError) else kind

@@ -76,10 +76,10 @@ def tuning(x: Tensor, y: Tensor, directions: Tensor) -> Tuning:
     samples = (both - center) / spread
     samples = torch.where(samples.abs() < MOST, samples, torch.nan)
     n, streams = x.shape[-1], x.shape[1]
-    widths = torch.tensor(WIDTHS, dtype=torch.float64) * math.sqrt(n)
-    laws = (torch.tensor(each, dtype=torch.float64) for each in (NOISES, FORGETTING))
+    widths = torch.tensor(WIDTHS, dtype=torch.float64, device="cpu") * math.sqrt(n)
+    laws = (torch.tensor(each, dtype=torch.float64, device="cpu") for each in (NOISES, FORGETTING))
     rows = torch.cartesian_prod(widths, *laws)
-    rows = torch.cat((rows, torch.tensor([DEFAULT], dtype=torch.float64)))
+    rows = torch.cat((rows, torch.tensor([DEFAULT], dtype=torch.float64, device="cpu")))
     first = _Candidates(*(rows[:, k].expand(streams, -1) for k in range(3)))
     first = first._replace(width=first.width.unsqueeze(-1).expand(-1, -1, n))
     found: list[tuple[Tensor, _Candidates, Tensor]] = []
@@ -103,7 +103,7 @@ def tuning(x: Tensor, y: Tensor, directions: Tensor) -> Tuning:
     width, stretch, wider = _widened(kept.width, spread[:, :n], extent, unknown)
     _warn(extent / width, width, wider)
     units = torch.cat((width, spread[:, n:]), 1)
-    radii = torch.tensor(RADII, dtype=torch.float64)[which]
+    radii = torch.tensor(RADII, dtype=torch.float64, device="cpu")[which]
     found_ = Tuning(center, units, kept.noise**2, kept.forgetting, radii, score, stretch, unknown.double())
     return _untold(found_, samples[..., n:])
 
@@ -138,7 +138,9 @@ def tuned_streams(
     functions = LocalFunctions.of(GaussianKernel(1.0), found.radius[0] * directions)
     law = found.ratio.clone(), found.forgetting.clone()
     filter_ = LocalFilter(functions, *law, follow * float(found.radius[0]), robust)
-    state = StreamState.empty(torch.zeros(0, dtype=dtype), len(found.ratio), n, len(directions), outputs)
+    state = StreamState.empty(
+        torch.zeros(0, dtype=dtype, device="cpu"), len(found.ratio), n, len(directions), outputs
+    )
     stretch = torch.cat((found.width, found.width.new_ones(len(found.width), outputs)), 1)
     units = torch.cat((found.center, found.spread), 1)
     return FilterStreams(filter_, state, True, units, stretch, found.unknown)
@@ -183,7 +185,7 @@ def _best(candidates: _Candidates, samples: Tensor, n: int, offsets: Tensor) -> 
     """The candidate of each stream that predicts the later two thirds best, (S, 1), and its likelihood."""
     score = _scores(candidates, samples, n, offsets)
     best = score.argmax(1)
-    rows = torch.arange(len(best))
+    rows = torch.arange(len(best), device="cpu")
     return _Candidates(*(part[rows, best, None] for part in candidates)), score[rows, best]
 
 
@@ -193,10 +195,14 @@ def _unknown(best: _Candidates, score: Tensor, samples: Tensor, n: int, offsets:
     Coordinates that say the same are needed together, so the least needed ones are left out one after the
     other, as long as the loss of all stays below `LITTLE`.
     """
-    alone = torch.eye(n, dtype=torch.bool).expand(len(score), -1, -1)  # candidate c leaves coordinate c out
+    alone = torch.eye(n, dtype=torch.bool, device="cpu").expand(
+        len(score), -1, -1
+    )  # candidate c leaves coordinate c out
     losses = score[:, None] - _scores(_without(best, alone), samples, n, offsets)
     rank = losses.argsort(1).argsort(1)  # 0 for the least needed
-    first = rank[:, None, :] <= torch.arange(n)[:, None]  # candidate c leaves the c + 1 least needed out
+    first = (
+        rank[:, None, :] <= torch.arange(n, device="cpu")[:, None]
+    )  # candidate c leaves the c + 1 least needed out
     together = score[:, None] - _scores(_without(best, first), samples, n, offsets)
     little = (together < LITTLE).long().cumprod(1)
     return little.gather(1, rank).bool()
@@ -260,7 +266,7 @@ def _around(best: _Candidates, wide: float, draw: torch.Generator) -> _Candidate
 
     def factor(like: Tensor) -> Tensor:
         shape = (1, AROUND, *like.shape[2:])  # for all streams the same, whoever is beside them
-        return (wide * torch.randn(shape, generator=draw, dtype=torch.float64)).exp()
+        return (wide * torch.randn(shape, generator=draw, dtype=torch.float64, device="cpu")).exp()
 
     lost = (1 - best.forgetting).clamp(min=1e-4) * factor(best.forgetting)
     noise = (best.noise * factor(best.noise) ** 2).clamp(min=1e-5)

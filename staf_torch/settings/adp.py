@@ -104,7 +104,7 @@ def _inputs(system: Plant) -> int:
     """Return m, which a class that states none shows in its effectiveness."""
     if not isinstance(system, ControlAffineSystem):
         return system.inputs
-    return system.effectiveness(torch.zeros(1, system.dim or 0, dtype=torch.float64)).shape[-1]
+    return system.effectiveness(torch.zeros(1, system.dim or 0, dtype=torch.float64, device="cpu")).shape[-1]
 
 
 def make_cost(cfg: DictConfig, system: Plant) -> Cost:

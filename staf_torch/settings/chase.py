@@ -323,7 +323,7 @@ def centers_of(
         if isinstance(directions, str) or not directions:  # "???" where nothing was given
             raise fail(COMMAND_LINE, "centers.directions", "must be a list of points", directions)
         rows = [vector(COMMAND_LINE, "centers.directions", row, dim) for row in directions]
-        points = torch.tensor(rows, dtype=torch.float64)
+        points = torch.tensor(rows, dtype=torch.float64, device="cpu")
     elif dim is None:
         raise fail("centers", "dim", f"must be given for the layout {layout}: instantiate(..., dim=n)", dim)
     elif layout in fixed:
@@ -358,10 +358,10 @@ def initial_states(cfg: DictConfig | PlainSettings, dim: int) -> Tensor:
     the first k of them do not depend on how many follow.
     """
     stated = vector(COMMAND_LINE, "initial_state", plain(cfg.initial_state), dim)
-    first = torch.tensor(stated, dtype=torch.float64)
+    first = torch.tensor(stated, dtype=torch.float64, device="cpu")
     batch = integer(COMMAND_LINE, "trajectories", cfg.trajectories, least=1)
     spread = positive_real(COMMAND_LINE, "spread", cfg.spread)
-    rows = torch.rand(batch - 1, dim, dtype=torch.float64, generator=generator_of(cfg))
+    rows = torch.rand(batch - 1, dim, dtype=torch.float64, generator=generator_of(cfg), device="cpu")
     return torch.cat((first.unsqueeze(0), first + spread * (2 * rows - 1)))
 
 
@@ -392,7 +392,9 @@ def local_problem(cfg: DictConfig, states: str) -> LocalProblem:
     count = integer(COMMAND_LINE, states, OmegaConf.select(cfg, states), least=1)
     path = simulate(problem.system, problem.initial_states[:1], dt=problem.dt, steps=problem.steps)[0]
     # Without the last one: over one period that is the first again.
-    index = (torch.arange(min(count, problem.steps)) * problem.steps) // min(count, problem.steps)
+    index = (torch.arange(min(count, problem.steps), device="cpu") * problem.steps) // min(
+        count, problem.steps
+    )
     radius = positive_real(COMMAND_LINE, "centers.radius", cfg.centers.radius)
     return LocalProblem(
         problem.basis.kernel, problem.target, radius, path[index], index.to(path) * problem.dt

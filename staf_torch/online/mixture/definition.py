@@ -49,10 +49,12 @@ class BankDefinition:
 
     def __init__(self, shape: BankShape, rules: Rules, functions: LocalFunctions) -> None:
         self.shape, self.rules, self.functions = shape, rules, functions
-        ratio = torch.full((len(rules.carried_forgetting),), rules.carried_ratio, dtype=torch.float64)
-        forgetting = torch.tensor(rules.carried_forgetting, dtype=torch.float64)
-        self.share = torch.tensor(rules.quadratic_forgetting, dtype=torch.float64)
-        self.prior = torch.tensor(rules.quadratic_prior, dtype=torch.float64)
+        ratio = torch.full(
+            (len(rules.carried_forgetting),), rules.carried_ratio, dtype=torch.float64, device="cpu"
+        )
+        forgetting = torch.tensor(rules.carried_forgetting, dtype=torch.float64, device="cpu")
+        self.share = torch.tensor(rules.quadratic_forgetting, dtype=torch.float64, device="cpu")
+        self.prior = torch.tensor(rules.quadratic_prior, dtype=torch.float64, device="cpu")
         self.filter = LocalFilter(functions, ratio, forgetting, rules.carried_slack)
 
     def each(self, table: Tensor, answers: Tensor) -> list[Views]:
@@ -68,11 +70,13 @@ class BankDefinition:
         s["last_x"].fill_(torch.nan)
         for name in ("spread", "excess", "error", "pace", "own", "best", "calibration", "quadratic_error"):
             s[name].fill_(1.0)
-        s["correction_covariance"].copy_(self.rules.correction_prior * torch.eye(GROUPS, dtype=torch.float64))
+        s["correction_covariance"].copy_(
+            self.rules.correction_prior * torch.eye(GROUPS, dtype=torch.float64, device="cpu")
+        )
         for name in ("rate", "noise", "forgetting"):
             rule = getattr(self.rules, f"tracker_{name}")
-            s[f"tracker_{name}"].copy_(torch.tensor(rule, dtype=torch.float64))
-        s["metric"].copy_(torch.eye(self.shape.dim, dtype=torch.float64))
+            s[f"tracker_{name}"].copy_(torch.tensor(rule, dtype=torch.float64, device="cpu"))
+        s["metric"].copy_(torch.eye(self.shape.dim, dtype=torch.float64, device="cpu"))
         s["order"].fill_(-1.0)
         s["gap"].fill_(torch.inf)
         s["low"].fill_(torch.inf)
@@ -80,7 +84,9 @@ class BankDefinition:
         self._restart_linear(s)
 
     def _restart_linear(self, s: Views) -> None:
-        s["covariance"].copy_(self.rules.linear_prior * torch.eye(self.shape.dim + 1, dtype=torch.float64))
+        s["covariance"].copy_(
+            self.rules.linear_prior * torch.eye(self.shape.dim + 1, dtype=torch.float64, device="cpu")
+        )
         s["linear"].zero_()
         s["filters"].zero_()
         s["filters"][: 2 * self.shape.dim].fill_(torch.nan)
@@ -115,7 +121,7 @@ class BankDefinition:
         """Store the prediction of every member at x and a time, and their mixture."""
         r, n = self.rules, self.shape.dim
         center, spread = self._units(s)
-        u = torch.cat((torch.ones(1, dtype=torch.float64), (x - center[:n]) / spread[:n]))
+        u = torch.cat((torch.ones(1, dtype=torch.float64, device="cpu"), (x - center[:n]) / spread[:n]))
         line = (s["linear"] * u).sum(-1)
         process = self._local_processes(s, x, now, u[1:], line)
         carried = self.filter.predict(self._filters(s), u[1:].expand(len(r.carried_forgetting), -1))
@@ -175,7 +181,7 @@ class BankDefinition:
         fades = [torch.ones_like(ages), *((-rate * ages).exp() for rate in r.fade_rates)]
         kernels = [sides[0][w] * fade for fade in fades for w in (0, 0, 1, 1, 2, 2)]
         kernels += [sides[1][w] for w in (0, 0, 1, 1, 2, 2)]
-        noise = torch.tensor(r.noise, dtype=torch.float64)
+        noise = torch.tensor(r.noise, dtype=torch.float64, device="cpu")
         rest = torch.stack([rests[select] for select in (0, 0, 0, 1) for _ in range(6)])  # (24, K, k)
         means, variances, unknown = _processes(torch.stack(kernels), noise, rest, line)
         s["unknown"].copy_(unknown[JUDGED])
@@ -185,7 +191,7 @@ class BankDefinition:
         """The linear model, the quadratics, the trackers and the filters learn (x, y)."""
         r, n = self.rules, self.shape.dim
         center, spread = self._units(s)
-        u = torch.cat((torch.ones(1, dtype=torch.float64), (x - center[:n]) / spread[:n]))
+        u = torch.cat((torch.ones(1, dtype=torch.float64, device="cpu"), (x - center[:n]) / spread[:n]))
         v = (y - center[n:]) / spread[n:]
         gain = (s["covariance"] * u).sum(-1)
         total = 1 + (u * gain).sum()
@@ -198,7 +204,7 @@ class BankDefinition:
         rules = s["tracker_rate"], s["tracker_noise"], s["tracker_forgetting"] ** lapse
         _trackers(s).learn(_tracked_at(s, u[1:]), v, *rules, r.tracker_jitter, r.tracker_wrong)
         state, lanes = self._filters(s), len(r.carried_forgetting)
-        lapses = torch.full((lanes,), lapse, dtype=torch.float64)
+        lapses = torch.full((lanes,), lapse, dtype=torch.float64, device="cpu")
         self.filter.learn(state, u[1:].expand(lanes, -1), v.expand(lanes, -1), lapses)
         s["filters"][:-1].copy_(state.table)
         s["filters"][-1].copy_(state.counts[3])
@@ -404,7 +410,7 @@ def _processes(kernels: Tensor, noise: Tensor, rest: Tensor, line: Tensor) -> tu
         line: what is added to the means, (K,).
     """
     a, count = kernels.clone(), kernels.shape[-1] - 1
-    a[:, :count, :count] += noise[:, None, None] * torch.eye(count, dtype=a.dtype)
+    a[:, :count, :count] += noise[:, None, None] * torch.eye(count, dtype=a.dtype, device=a.device)
     seen, mean = torch.zeros_like(noise), torch.zeros_like(rest[..., 0])
     amplitude, right = torch.zeros_like(mean), rest.clone()
     for k in range(count):

@@ -91,10 +91,10 @@ class QuadraticModels(NamedTuple):
 def quadratic_features(u: Tensor, count: int) -> Tensor:
     """1, the coordinates u (n,), and as far as ``count`` goes their products or their squares: (count,)."""
     n = len(u)
-    first, second = torch.triu_indices(n, n)
+    first, second = torch.triu_indices(n, n, device="cpu")
     if count == 2 * n + 1:
-        first = second = torch.arange(n)
-    return torch.cat((torch.ones(1, dtype=u.dtype), u, u[first] * u[second]))[:count]
+        first = second = torch.arange(n, device="cpu")
+    return torch.cat((torch.ones(1, dtype=u.dtype, device=u.device), u, u[first] * u[second]))[:count]
 
 
 class TrackerModels(NamedTuple):
@@ -135,7 +135,7 @@ class TrackerModels(NamedTuple):
         novel = rest >= 10 * jitter
         grown = torch.where(novel, 1 / rest, 0.0)
         learned = 1 / (spread.clamp(min=0.0) + noise)
-        places = torch.arange(len(k))[:, None]
+        places = torch.arange(len(k), device="cpu")[:, None]
         own = (novel & (self.counts[0] == places)).to(k)
         self.points.copy_(torch.where(own.bool()[:, None], x, self.points))
         s = torch.where(novel, 0.0, q) - share * b + own
@@ -162,7 +162,7 @@ class TrackerModels(NamedTuple):
 
     def _drifted(self, inverse: Tensor, size: int, rate: Tensor, jitter: float, wrong: float) -> Tensor:
         """Return whether the inverse times a column of the kernels is wrong, at one place a sample: (L,)."""
-        lanes = torch.arange(len(rate))
+        lanes = torch.arange(len(rate), device=rate.device)
         at = torch.where(self.counts[2] < size, self.counts[2], 0.0).long()
         self.counts[2] = at + 1
         apart = (self.points.permute(2, 0, 1) - self.points[at, :, lanes][:, None]).square().sum(-1)
@@ -179,7 +179,7 @@ class TrackerModels(NamedTuple):
 
 @functools.cache
 def _below(size: int) -> Tensor:
-    return torch.tril_indices(size, size)
+    return torch.tril_indices(size, size, device="cpu")
 
 
 def _whole(lower: Tensor) -> Tensor:
@@ -256,7 +256,7 @@ def likelihoods(s: Stretch, rate: Tensor, noise: Tensor, fade: Tensor) -> Tensor
     apart = torch.cdist(s.at, s.at, compute_mode="donot_use_mm_for_euclid_dist").square()
     age = (s.when[:, None] - s.when).abs()
     gram = (-rate[:, None, None] * apart - fade[:, None, None] * age).exp()
-    gram = gram + noise[:, None, None] * torch.eye(len(apart), dtype=apart.dtype)
+    gram = gram + noise[:, None, None] * torch.eye(len(apart), dtype=apart.dtype, device=apart.device)
     factor = torch.linalg.cholesky(gram)
     squares = torch.linalg.solve_triangular(factor, s.y, upper=False).square().sum(1)  # (L, K)
     logs = factor.diagonal(dim1=1, dim2=2).log().sum(1)
@@ -275,7 +275,9 @@ def _better(s: Stretch, rate: Tensor, noise: Tensor, fade: Tensor, best: Hyperpa
 
 def _around(s: Stretch, of_width: float, of_noise: float, best: Hyperparameters) -> Hyperparameters:
     """The best and its eight neighbours, widths a factor apart and noises another."""
-    steps = torch.tensor([(a, b) for b in (-1, 0, 1) for a in (-1, 0, 1) if a or b], dtype=torch.float64)
+    steps = torch.tensor(
+        [(a, b) for b in (-1, 0, 1) for a in (-1, 0, 1) if a or b], dtype=torch.float64, device="cpu"
+    )
     rate, noise = best.rate * of_width ** (-2 * steps[:, 0]), best.noise * of_noise ** steps[:, 1]
     return _better(s, rate, noise, torch.full_like(rate, best.fade), best)
 
@@ -284,7 +286,7 @@ def search(s: Stretch) -> Hyperparameters:
     """The likeliest process that does not fade: widths from 1/4 to 32 sqrt(n)."""
     n = s.at.shape[1]
     best = Hyperparameters(1 / (2 * n), 1.0, 0.0, -math.inf)
-    rate = 2.0 ** (4 - 2 * torch.arange(8, dtype=torch.float64)) / (2 * n)
+    rate = 2.0 ** (4 - 2 * torch.arange(8, dtype=torch.float64, device="cpu")) / (2 * n)
     for noise in (1e-6, 1e-4, 1e-2, 0.3):
         best = _better(s, rate, torch.full_like(rate, noise), torch.zeros_like(rate), best)
     best = _around(s, 2**0.5, 10.0, best)
@@ -292,8 +294,8 @@ def search(s: Stretch) -> Hyperparameters:
 
 
 def _search_fading(s: Stretch, best: Hyperparameters) -> Hyperparameters:
-    fade = torch.tensor(FADES * 2, dtype=torch.float64)
-    wider = torch.arange(8) >= 4
+    fade = torch.tensor(FADES * 2, dtype=torch.float64, device="cpu")
+    wider = torch.arange(8, device="cpu") >= 4
     rate = best.rate / torch.where(wider, 4.0, 1.0).double()
     noise = best.noise / torch.where(wider, 10.0, 1.0).double()
     return _around(s, 2.0, 10.0, _better(s, rate, noise, fade, best))
@@ -304,10 +306,12 @@ def sensitivity(s: Stretch, c: Hyperparameters) -> Tensor:
     m, n = s.at.shape
     ways = s.at - s.at[:, None]  # from i to j, (m, m, n)
     kernel = (-c.rate * ways.square().sum(-1)).exp()
-    weights = torch.linalg.solve(kernel + c.noise * torch.eye(m, dtype=kernel.dtype), s.y)
+    weights = torch.linalg.solve(
+        kernel + c.noise * torch.eye(m, dtype=kernel.dtype, device=kernel.device), s.y
+    )
     gradients = torch.einsum("ij,jo,ijp->iop", kernel, weights, ways).flatten(0, 1)
     outer = gradients.mT @ gradients
-    trace, eye = outer.trace(), torch.eye(n, dtype=kernel.dtype)
+    trace, eye = outer.trace(), torch.eye(n, dtype=kernel.dtype, device=kernel.device)
     share = outer / trace if float(trace) > 0 else eye / n
     metric: Tensor = torch.linalg.cholesky((share * n + RIDGE * n * eye) / (1 + RIDGE * n))
     return metric

@@ -10,7 +10,7 @@ from .rules import BLENDS, CARRIED, GROUPS, KNOTS, LOCAL, MEMBERS, QUADRATIC, Ru
 
 _LEAST = 1e-30  # of a variance
 _STILL = 1e-4  # variance, in units, of what has been constant so far
-_GROUP = torch.tensor([group(member) for member in range(MEMBERS)], dtype=torch.int64)
+_GROUP = torch.tensor([group(member) for member in range(MEMBERS)], dtype=torch.int64, device="cpu")
 
 
 def constant(s: dict[str, Tensor]) -> Tensor:
@@ -53,7 +53,9 @@ def mix(r: Rules, s: dict[str, Tensor], low: Tensor, high: Tensor, level: Tensor
     claims = s["variances"].clamp(min=_LEAST).log()
     behind = claims + s["excess"].log()
     surplus = torch.minimum(claims - s["usual"], behind - behind.amin(-1, keepdim=True)).clamp(min=0.0)
-    logs = s["weights"] - torch.tensor(r.doubts, dtype=torch.float64)[:, None] * surplus[:, None]
+    logs = (
+        s["weights"] - torch.tensor(r.doubts, dtype=torch.float64, device="cpu")[:, None] * surplus[:, None]
+    )
     weights = (logs - logs.amax(-1, keepdim=True)).exp()
     weights = torch.where(weights < r.drop, 0.0, weights)
     weights = weights / weights.sum(-1, keepdim=True)  # (K, clocks, members)
@@ -157,7 +159,7 @@ def judge(r: Rules, s: dict[str, Tensor], value: Tensor, told: Tensor, t: float)
     of = slice(LOCAL + CARRIED, LOCAL + CARRIED + QUADRATIC)
     factor = 1 + max(r.pace, 1 / (t + 2)) * (torch.minimum(ratio[:, of], larger) - 1)
     put("quadratic_error", (s["quadratic_error"] * factor).clamp(min=1e-26))
-    discounts = torch.tensor(r.discounts, dtype=torch.float64)[:, None]
+    discounts = torch.tensor(r.discounts, dtype=torch.float64, device="cpu")[:, None]
     put("weights", _reweighed(r.share, discounts * s["weights"] + score[:, None]))
     put("clock_weights", _reweighed(r.share, r.discount * s["clock_weights"] + over))
     put("surprises", torch.where(z2 > SURPRISE, (s["surprises"] + 1).clamp(max=40.0), 0.0))

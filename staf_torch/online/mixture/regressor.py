@@ -103,14 +103,14 @@ class Bank:
         self._run = _built(shape) if compile else None
         self.compiled = self._run is not None  # and not the definition
         self.definition = BankDefinition(shape, rules, functions)
-        self.table = torch.zeros(0, size(layout(shape)), dtype=torch.float64)
+        self.table = torch.zeros(0, size(layout(shape)), dtype=torch.float64, device="cpu")
         self.add(streams)
 
     def add(self, streams: int) -> None:
         """Begin further streams, behind the others."""
         old = len(self.table)
         self.replace(torch.cat((self.table, self.table.new_zeros(streams, self.table.shape[1]))))
-        self.clear(torch.arange(old, old + streams))
+        self.clear(torch.arange(old, old + streams, device="cpu"))
 
     def replace(self, table: Tensor) -> None:
         """Hold these streams, (S, size), instead."""
