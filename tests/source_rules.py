@@ -59,8 +59,18 @@ def without_encoding(nodes: Sequence[ast.AST]) -> Iterator[str]:
         modes = [each.value for each in ast.walk(node) if isinstance(each, ast.Constant)]
         binary = any(isinstance(mode, str) and "b" in mode for mode in modes)
         opened = _called(node.func) == "open" and ast.unparse(node.func) != "os.open" and not binary
+        opened = opened and not _opens_no_file(node)
         if opened or (isinstance(node.func, ast.Attribute) and node.func.attr in _TEXT):
             yield f"{node.lineno}: {ast.unparse(node)[:80]}"
+
+
+def _opens_no_file(node: ast.Call) -> bool:
+    """Whether it is a method of that name of something else: of a path, it would be given a mode or nothing."""
+    function = node.func
+    given = bool(node.args) and not any(isinstance(each, ast.Constant) for each in node.args)
+    return (
+        isinstance(function, ast.Attribute) and given and ast.unparse(function.value) not in ("io", "codecs")
+    )
 
 
 def _called(function: ast.expr) -> str:

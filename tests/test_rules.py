@@ -385,6 +385,7 @@ ABSENT = {
         "near_optimal.dt",
         "near_optimal.horizon",
         "report.spread",
+        "report.states",
     ),
     *("SafetyFilter.weight", "SafetyFilter.decay", "BoundedInputCost.bound", "PathIntegral.noise"),
 }
