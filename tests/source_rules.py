@@ -65,7 +65,7 @@ def without_encoding(nodes: Sequence[ast.AST]) -> Iterator[str]:
 
 
 def _opens_no_file(node: ast.Call) -> bool:
-    """Whether it is a method of that name of something else: of a path, it would be given a mode or nothing."""
+    """Whether it is a method of something else: of a path, it would be given a mode or nothing."""
     function = node.func
     given = bool(node.args) and not any(isinstance(each, ast.Constant) for each in node.args)
     return (
