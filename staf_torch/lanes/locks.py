@@ -48,7 +48,7 @@ class ReadWriteLock(Mutex):
         self._writing = False
 
     def read(self, function: Callable[..., Some], *given: Any) -> Some:
-        """Return function(*given) while nobody writes; who reads or writes may read, who reads must not write."""
+        """Return function(*given) while nobody writes; who reads may read again, but not write."""
         reader = object()
         try:  # begins before the entry, and an interrupt leaves none behind
             self._readers[reader] = thread = threading.get_ident()
