@@ -2,11 +2,11 @@
 
     python tests/sanitized.py [--calls 10000] [--seed 0] [--compiler clang++]
 
-Row programs (a chase is one), filters of streams and banks of local models are built with both sanitizers
-and called with shapes, layouts and dtypes drawn at random: 0 and 1 rows and times, strided, transposed,
-expanded and misaligned tensors, and inputs that must be refused. A bad read, a bad write or undefined
-behaviour ends the process; what is returned is compared with plain torch. In the end a read outside is made
-on purpose, which has to be found.
+Row programs (a chase is one), filters of streams and banks of local models are built with both sanitizers,
+shared by four threads that ask and learn, and called with shapes, layouts and dtypes drawn at random: 0 and 1
+rows and times, strided, transposed, expanded and misaligned tensors, and inputs that must be refused. A bad
+read, a bad write or undefined behaviour ends the process; what is returned is compared with plain torch. In
+the end a read outside is made on purpose, which has to be found.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 FLAGS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-fno-omit-frame-pointer")
 SECONDS = 60  # of the processor, for a call; ten times as many by the clock
-LIBRARIES = {"programs": "lanes", "filters": "filter", "banks": "bank"}  # what each kind builds
+LIBRARIES = {"programs": "lanes", "filters": "filter", "banks": "bank", "threads": "bank"}
+"""What each kind builds."""
 ROWS, TIMES = (0, 1, 1, 2, 3, 7, 8, 9, 16, 17, 33), (0, 1, 1, 2, 3, 5)
 
 
@@ -63,7 +64,7 @@ def run(
         "LD_PRELOAD": str(_runtime(compiler)),
         "ASAN_OPTIONS": "detect_leaks=0:exitcode=66",
         "UBSAN_OPTIONS": "print_stacktrace=1:halt_on_error=1",
-        "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]),
+        "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")]),
         "XDG_CACHE_HOME": str(cache),
         "CXX": compiler,
         "CXXFLAGS": " ".join((*FLAGS, level, *(("-shared-libasan",) if "clang" in compiler else ()))),
@@ -82,6 +83,7 @@ def run(
 def inside(calls: int, seed: int, chosen: Sequence[str]) -> None:
     """Call native code so often, in a process that has the sanitizers loaded."""
     import torch
+    from helpers_threads import OBJECTS, crowd
 
     from staf_torch import lanes
     from staf_torch.online import StaFRegressor
@@ -170,8 +172,12 @@ def inside(calls: int, seed: int, chosen: Sequence[str]) -> None:
                 bank.keep(torch.arange(bank.count)[1:])
                 bank.add(2)
 
-    kinds = {"programs": a_program, "filters": a_filter, "banks": a_bank}
-    often = {"programs": 6, "filters": 2, "banks": 1}
+    def some_threads() -> None:
+        with lanes.compiling("always"):
+            crowd(OBJECTS[chance.choice([*OBJECTS])], chance.choice([1, 8, 60]))
+
+    kinds = {"programs": a_program, "filters": a_filter, "banks": a_bank, "threads": some_threads}
+    often = {"programs": 30, "filters": 10, "banks": 5, "threads": 1}
     counts = dict.fromkeys(chosen, 0)
     for at in range(calls):
         weights = [often[kind] for kind in chosen]

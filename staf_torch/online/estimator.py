@@ -97,8 +97,11 @@ class ScikitEstimator:
         return float(np.mean(1 - np.where(total > 0, left / np.where(total > 0, total, 1), met)))
 
     def __repr__(self) -> str:
-        arguments = ", ".join(f"{name}={value!r}" for name, value in self.get_params(deep=False).items())
-        return f"{type(self).__name__}({arguments})"
+        """Show arguments that differ from their defaults, as scikit-learn does; tensors by their shape."""
+        usual = inspect.signature(type(self)).parameters
+        told = {name: _shown(value) for name, value in self.get_params(deep=False).items()}
+        differ = [f"{name}={text}" for name, text in told.items() if text != _shown(usual[name].default)]
+        return f"{type(self).__name__}({', '.join(differ)})"
 
     def __sklearn_is_fitted__(self) -> bool:
         return "_streams_" in self.__dict__
@@ -124,6 +127,11 @@ def _arguments(kernel: Kernel) -> dict[str, Any]:
     """The arguments that a kernel was made with, as far as it keeps them by their names."""
     found = {name: getattr(kernel, name) for name in _parameters(type(kernel)) if hasattr(kernel, name)}
     return {k: float(v) if isinstance(v, Tensor) and v.dim() == 0 else v for k, v in found.items()}
+
+
+def _shown(value: Any) -> str:
+    arrays = isinstance(value, Tensor | np.ndarray) and value.ndim > 0
+    return f"<{type(value).__name__} {tuple(value.shape)}>" if arrays else repr(value)
 
 
 def _parameters(kind: type) -> list[str]:
@@ -181,6 +189,7 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
     _shape_: tuple[int, ...] = ()  # of a sample's x
     _targets_: tuple[int, ...] = ()  # of its y
     _dtype_: torch.dtype
+    _device_: torch.device
     _in_place_: torch.dtype | None = None  # of samples that compiled code reads where they are
     _direct_: DirectCalls | None = None  # calls that need no lock
 
@@ -266,8 +275,8 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         streams = self._streams_
         if states.shape != self._shape_ or (values.dim() == states.dim()) != (self.n_outputs_ is not None):
             raise self._refusal("partial_fit", states, values)
-        rows = states.to(streams.dtype).reshape(streams.count, self.n_features_in_).contiguous()
-        targets = values.to(streams.dtype).reshape(streams.count, -1).contiguous()
+        rows = self._placed("partial_fit", "x", states).reshape(streams.count, -1).contiguous()
+        targets = self._placed("partial_fit", "y", values).reshape(streams.count, -1).contiguous()
         if targets.shape[1] != (self.n_outputs_ or 1):
             raise self._refusal("partial_fit", states, values)
         streams.learn(rows, targets, None if lapse is None else lapse.expand(streams.count).contiguous())
@@ -316,12 +325,13 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         if ((*points.shape[:-2], points.shape[-1]) if several else tuple(points.shape)) != self._shape_:
             raise self._refusal("predict", points)
         streams, whole = self._streams_, points if several else points.unsqueeze(-2)
-        rows = whole.to(streams.dtype).reshape(streams.count, whole.shape[-2], whole.shape[-1])
+        real = points.dtype if points.dtype in _DTYPES.values() else streams.dtype  # the caller's
+        rows = self._placed("predict", "x", whole).reshape(streams.count, whole.shape[-2], whole.shape[-1])
         found = [streams.predict(row.contiguous()) for row in rows.unbind(1)]
         shape = (*points.shape[:-1], *(() if self.n_outputs_ is None else (self.n_outputs_,)))
 
         def joined(which: int) -> Any:
-            parts = [pair[which] for pair in found]
+            parts = [pair[which].to(real) for pair in found]
             return like_given(x, torch.stack(parts, 1).reshape(shape) if parts else points.new_empty(shape))
 
         return (joined(0), joined(1)) if return_std else joined(0)
@@ -332,11 +342,23 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         count = 1 if x.dim() == 1 else x.shape[0]
         outputs = y.shape[-1] if y.dim() == x.dim() else 1
         self._streams_ = self._begin(count, outputs, torch.zeros(x.shape[-1], dtype=dtype, device=x.device))
-        self._shape_, self._targets_, self._dtype_ = tuple(x.shape), tuple(y.shape), dtype
+        self._shape_, self._targets_ = tuple(x.shape), tuple(y.shape)
+        self._dtype_, self._device_ = dtype, x.device
         self._in_place_ = dtype if self._streams_.compiled else None
         self.n_features_in_ = x.shape[-1]
         self.n_streams_ = None if x.dim() == 1 else count
         self.n_outputs_ = outputs if y.dim() == x.dim() else None
+
+    def _placed(self, call: str, name: str, value: Tensor) -> Tensor:
+        """Return a sample in the dtype of the streams.
+
+        Raises:
+            ValueError: if it is on another device than the first sample.
+        """
+        if value.device != self._device_:
+            rule = f"must be on {self._device_}, where the first sample was"
+            raise ValueError(f"`{self._call(call)}({name}=...)` {rule}; got one on {value.device}.")
+        return value.to(self._streams_.dtype)
 
     def _refusal(self, call: str, x: Tensor, y: Tensor | None = None) -> ValueError:
         """Return the error of a sample whose shapes are not those of the first one."""

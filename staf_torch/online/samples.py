@@ -16,6 +16,11 @@ def tensor_of(call: str, name: str, value: Any) -> Tensor:
     """A tensor as it is; arrays and numbers as tensors; integers as float64."""
     if isinstance(value, Tensor):
         refuse_gradient(call, **{name: value})
+        if value.is_nested or value.layout is not torch.strided or value.is_complex():
+            kind = "nested" if value.is_nested else f"{value.layout}, {value.dtype}"
+            raise ValueError(
+                f"`{call}({name}=...)` must be a dense tensor of real numbers; got one that is {kind}."
+            )
         found = value.detach()
     else:
         try:
@@ -26,7 +31,8 @@ def tensor_of(call: str, name: str, value: Any) -> Tensor:
                 array = array.astype(float)
             if np.iscomplexobj(array):
                 raise ValueError("Complex data not supported")
-            found = torch.from_numpy(array if array.flags.writeable else array.copy())
+            plain = array.flags.writeable and array.dtype.isnative and min(array.strides, default=0) >= 0
+            found = torch.as_tensor(array if plain else array.astype(array.dtype.newbyteorder("=")))
         except (TypeError, ValueError, RuntimeError) as error:
             kind = TypeError if hasattr(value, "toarray") or "convert" not in str(error) else ValueError
             kind = ValueError if isinstance(error, ValueError) else kind

@@ -18,6 +18,8 @@ KINDS_OF_NUMBERS = [
     torch.tensor([1.0, 2.0], dtype=torch.float64),
     torch.tensor([1.0, 2.0], dtype=torch.float16),
     np.array([1.0, 2.0], np.float32),
+    np.array([2.0, 1.0])[::-1],
+    np.array([1.0, 2.0], ">f8"),
     np.array([1, 2.0], dtype=object),
     [1, 2],
     (1.0, 2.0),
@@ -33,6 +35,10 @@ def test_numbers_of_any_kind_are_samples(value: Any) -> None:
     assert model.state_dict()["dtype"] == ("torch.float32" if single else "torch.float64")
     assert float(model.predict(value)) == pytest.approx(3.0, rel=1e-3)
     assert isinstance(model.predict(value), torch.Tensor if isinstance(value, torch.Tensor) else np.ndarray)
+    assert model.predict(torch.ones(2)).dtype == torch.float32  # the caller's, whatever the first sample had
+    assert model.predict(np.ones(2)).dtype == np.float64
+    with pytest.raises(ValueError, match=r"predict\(x=...\)` must be on cpu, where the first.*meta"):
+        model.predict(torch.ones(2, device="meta"))
 
 
 class Sparse:

@@ -76,6 +76,16 @@ def test_river_adapter_takes_features_by_name() -> None:
         errors.append(model.predict_one(sample) - value)
         model.learn_one(sample, value)
     assert math.isfinite(model.predict_one({"b": 3.0}))  # one that is missing was not measured
+    told = model.predict_one({"a": x[-1, 0], "b": x[-1, 1]}, with_dist=True)
+    mean, deviation = (float(part) for part in model.model.predict(x[-1, ::-1], return_std=True))
+    assert (told.mu, told.sigma) == (mean, deviation)
+    assert told(told.mu) == pytest.approx(1 / (deviation * math.sqrt(2 * math.pi)))
+    assert told.cdf(told.inv_cdf(0.05)) == pytest.approx(0.05)
+    assert RiverRegressor().predict_one({"a": 1.0}, with_dist=True).sigma == math.inf
+    with pytest.raises(ValueError, match=r"learn_one\(x\['b'\]\)` must be a number, or None.*'wet'"):
+        model.learn_one({"a": 1.0, "b": "wet"}, 1.0)
+    with pytest.raises(ValueError, match=r"learn_one\(y\)` must be a number.*'no'"):
+        model.learn_one({"a": 1.0, "b": 2.0}, "no")
     assert np.sqrt(np.mean(np.square(errors[75:]))) < 0.05 * y.std()
 
 
@@ -152,11 +162,9 @@ def test_parameters_are_the_arguments_and_those_of_the_kernel() -> None:
     assert list(own)[:3] == ["kernel", "radius", "count"]
     assert "self" not in own
     assert model.get_params() == own | {"kernel__degree": 3, "kernel__bias": 0.5}
-    assert repr(model).startswith(
-        f"StaFRegressor(kernel={model.kernel!r}, radius=0.4, count=None, centers=None,"
-    )
-    assert "kernel__" not in repr(model)
-    assert repr(model).endswith("robust=None, scaling=False)")
+    assert repr(model) == f"StaFRegressor(kernel={model.kernel!r}, radius=0.4)"
+    assert repr(st.StaFRegressor(centers=np.zeros((3, 2)))) == "StaFRegressor(centers=<ndarray (3, 2)>)"
+    assert repr(RiverRegressor()) == "RiverRegressor(MixtureRegressor(memory=500))"
     assert st.StaFRegressor("matern").get_params() == st.StaFRegressor("matern").get_params(deep=False)
     named = st.StaFRegressor("gaussian").set_params(kernel__width=0.25, noise=0.5)
     assert isinstance(named.kernel, st.GaussianKernel)

@@ -1,0 +1,161 @@
+"""Objects that several threads, a fork or a copy have at once: what all of them see is whole."""
+
+from __future__ import annotations
+
+import copy
+import os
+import pickle
+import signal
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import torch
+from helpers_threads import COST, OBJECTS, PLANT, X, Y, crowd, together
+from variants import over
+
+import staf_torch as st
+from staf_torch import adp, lanes
+from staf_torch.online import MixtureRegressor, RiverRegressor
+
+LEARNERS = {
+    "filter": lambda: st.StaFRegressor(radius=0.3),
+    "filter with units": lambda: st.StaFRegressor(scaling=True),
+    "mixture": lambda: MixtureRegressor(128, 8),
+}
+
+
+@over(OBJECTS, "name")
+def test_four_threads_get_the_bits_of_one_and_ask_beside_others_that_learn(name: str) -> None:
+    crowd(OBJECTS[name], 24)
+
+
+@over(LEARNERS, "kind")
+def test_no_sample_of_several_threads_is_lost(kind: str) -> None:
+    model = LEARNERS[kind]()
+
+    def learn(number: int) -> None:
+        for k in range(50):
+            model.partial_fit(X[(4 * k + number) % 40], Y[(4 * k + number) % 40])
+
+    together(4, learn)
+    assert int(model.n_samples_seen_ + model.n_skipped_) == 200
+
+
+@over(LEARNERS, "kind")
+def test_who_asks_beside_one_that_learns_sees_it_before_or_after_a_sample(kind: str) -> None:
+    """And what was learned has the bits that it has without anybody who asks, also where x is learned."""
+    alone, model = (LEARNERS[kind]().partial_fit(X[0], Y[0]) for _ in range(2))
+    states = [float(alone.predict(X[7]))]
+    states += [float(alone.partial_fit(X[k], Y[k]).predict(X[7])) for k in range(1, 40)]
+    seen, done = set[float](), threading.Event()
+
+    def work(number: int) -> None:
+        if number:
+            while not done.is_set():
+                seen.add(float(model.predict(X[7])))
+                model.predict(X[8])
+            return
+        for k in range(1, 40):
+            model.partial_fit(X[k], Y[k])
+        done.set()
+
+    together(3, work)
+    assert seen <= set(states)
+    assert float(model.predict(X[7])) == states[-1]
+
+
+def test_streams_come_and_go_beside_threads_that_learn_and_ask() -> None:
+    model = st.StaFRegressor(radius=0.3)
+    refused = list[str]()
+    for k in range(5):
+        model.partial_fit(X[k : k + 2], Y[k : k + 2])
+
+    def work(number: int) -> None:
+        for k in range(40):
+            if number == 0:
+                model.add(1).drop([2])
+            elif number == 1:
+                model.reset(streams=[1])
+            else:
+                try:
+                    assert model.predict(X[k % 30 :][:2]).shape == (2,)
+                    model.partial_fit(X[k % 30 :][:2], Y[k % 30 :][:2])
+                except ValueError as error:  # there were three just then
+                    refused.append(str(error))
+
+    together(4, work)
+    assert model.n_streams_ == 2
+    assert all("must have the shape (3, 2) of the first sample" in told for told in refused)
+
+
+def test_one_of_several_threads_compiles_and_all_are_right() -> None:
+    gain = 0.1 + torch.rand(())
+
+    def step(x: torch.Tensor, u: torch.Tensor, row: tuple[()]) -> tuple[torch.Tensor, torch.Tensor]:
+        x = x + 0.01 * (u - gain * x.sin())
+        return x, x
+
+    program, inputs = lanes.Program(step), (X[0], X[:20].mT.clone())
+    wanted, found = program.definition(*inputs)[1], {}
+    together(4, lambda number: found.update({number: program(*inputs)[1]}))
+    assert all(torch.equal(found[0], each) for each in found.values())
+    torch.testing.assert_close(found[0], wanted)
+    policy = adp.Feedback(adp.LQR(PLANT, COST)).policy
+    with lanes.compiling("always"), ThreadPoolExecutor(4) as pool:
+        told = [*pool.map(policy, [X[k % 4] for k in range(40)])]
+    assert all(torch.equal(u, told[k % 4]) for k, u in enumerate(told))
+
+
+def test_modes_of_torch_are_each_threads_own() -> None:
+    policy, told = adp.RolloutPolicy.of_lqr(PLANT, COST), {}
+    lanes.ready(policy, X[0])
+    modes = [torch.no_grad, torch.inference_mode, torch.enable_grad, lambda: torch.device("cpu")]
+
+    def ask(number: int) -> None:
+        with modes[number]():
+            for _ in range(5):
+                told[number] = policy(X[3])
+
+    together(4, ask)
+    assert all(torch.equal(told[0], each) for each in told.values())
+
+
+@pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork")
+def test_copies_and_forks_beside_a_thread_that_learns_are_whole_and_free() -> None:
+    model, done = st.StaFRegressor(radius=0.3).fit(X, Y), threading.Event()
+
+    def learn() -> None:
+        k = 0
+        while not done.is_set():
+            model.partial_fit(X[k % 40], Y[k % 40], lapse=1.0)
+            k += 1
+
+    thread = threading.Thread(target=learn)
+    thread.start()
+    try:
+        for _ in range(5):
+            for twin in (copy.deepcopy(model), pickle.loads(pickle.dumps(model))):
+                assert twin.partial_fit(X[0], Y[0]).predict(X[1]).isfinite()
+            child = os.fork()
+            if child == 0:
+                signal.alarm(20)  # one that waits for a lock that nobody has ends so
+                model.partial_fit(X[0], Y[0], lapse=2.0)
+                os._exit(0 if bool(model.predict(X[1]).isfinite()) else 1)
+            assert os.waitpid(child, 0)[1] == 0
+    finally:
+        done.set()
+        thread.join()
+
+
+def test_names_of_rivers_features_are_those_of_one_first_sample() -> None:
+    model = RiverRegressor(st.StaFRegressor(radius=0.3))
+
+    def learn(number: int) -> None:
+        for k in range(25):
+            a, b = X[k].tolist()
+            model.learn_one({"a": a, "b": b} if number % 2 else {"b": b, "a": a}, float(Y[k]))
+            assert model.predict_one({"a": a, "b": b}, with_dist=True).sigma > 0
+
+    together(4, learn)
+    assert int(model.model.n_samples_seen_) == 100
