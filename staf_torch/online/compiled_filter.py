@@ -111,9 +111,12 @@ class CompiledFilter:
         """Let direct calls do nothing while the streams are changed, or go on with them."""
         self._streams.closed = closed
 
-    def predict(self, state: StreamState, x: Tensor) -> tuple[Tensor, Tensor]:
+    def predict(
+        self, state: StreamState, x: Tensor, shape: tuple[int, ...] | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of the next y at x (S, n), contiguous, of the table's dtype: (S, K)."""
-        mean, deviation = x.new_empty(self._shape), x.new_empty(self._shape)
+        shape = self._shape if shape is None else shape
+        mean, deviation = x.new_empty(shape), x.new_empty(shape)
         places = x.data_ptr(), 0, 0, mean.data_ptr(), deviation.data_ptr()
         self._run(_packed(self.reference, 1, *places))
         return mean, deviation
@@ -146,12 +149,9 @@ class DirectCalls:
         """Do nothing from now on."""
         self.filter.close(True)
 
-    def open(self, streams: Any) -> bool:
-        """Go on, unless the streams have got another filter since: return whether."""
-        same = getattr(streams, "_filter", None) is self.filter
-        if same:
-            self.filter.close(False)
-        return same
+    def open(self) -> None:
+        """Go on."""
+        self.filter.close(False)
 
     def learn(self, x: Any, y: Any) -> bool:
         """Learn one sample a stream; False where it does not fit, or the streams are just changed."""

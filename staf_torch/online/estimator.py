@@ -237,6 +237,7 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         if state is not None:
             self._take_extra(state)
         vars(self).update({name: value for name, value in vars(twin).items() if name.endswith("_")})
+        self._direct_ = self._streams_.direct(self._shape_, self._targets_)  # after a state was loaded
 
     @opaque
     def partial_fit(self, x: Any, y: Any, lapse: Any = None) -> Self:
@@ -279,7 +280,12 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         targets = self._placed("partial_fit", "y", values).reshape(streams.count, -1).contiguous()
         if targets.shape[1] != (self.n_outputs_ or 1):
             raise self._refusal("partial_fit", states, values)
-        streams.learn(rows, targets, None if lapse is None else lapse.expand(streams.count).contiguous())
+        times = None if lapse is None else lapse.expand(streams.count).contiguous()
+        if not torch._C._len_torch_function_stack():
+            streams.learn(rows, targets, times)
+            return
+        with self._device_:  # whatever the default device is
+            streams.learn(rows, targets, times)
 
     @opaque
     def predict(self, x: Any, return_std: bool = False) -> Any:
@@ -305,15 +311,16 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         self._lock.write(self._changed, function, *given)
 
     def _changed(self, function: Callable[..., object], *given: Any) -> None:
-        direct, streams = self._direct_, self.__dict__.get("_streams_")
-        if direct is not None:
-            direct.close()
+        direct = self._direct_
+        if direct is None:
+            function(*given)
+            return
+        direct.close()
         try:
             function(*given)
         finally:
-            now = self.__dict__.get("_streams_")
-            if direct is None or now is not streams or not direct.open(now):
-                self._direct_ = None if now is None else now.direct(self._shape_, self._targets_)
+            if self._direct_ is direct:  # else its streams are no longer these
+                direct.open()
 
     def _predict(self, x: Any, return_std: bool) -> Any:
         if in_place(x, self._in_place_, self._shape_):
@@ -327,12 +334,17 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         streams, whole = self._streams_, points if several else points.unsqueeze(-2)
         real = points.dtype if points.dtype in _DTYPES.values() else streams.dtype  # the caller's
         rows = self._placed("predict", "x", whole).reshape(streams.count, whole.shape[-2], whole.shape[-1])
-        found = [streams.predict(row.contiguous()) for row in rows.unbind(1)]
+        if not torch._C._len_torch_function_stack():
+            found = [streams.predict(row.contiguous()) for row in rows.unbind(1)]
+        else:
+            with self._device_:  # whatever the default device is
+                found = [streams.predict(row.contiguous()) for row in rows.unbind(1)]
         shape = (*points.shape[:-1], *(() if self.n_outputs_ is None else (self.n_outputs_,)))
 
         def joined(which: int) -> Any:
-            parts = [pair[which].to(real) for pair in found]
-            return like_given(x, torch.stack(parts, 1).reshape(shape) if parts else points.new_empty(shape))
+            parts = [pair[which] for pair in found]
+            whole = torch.stack(parts, 1).reshape(shape) if parts else points.new_empty(shape)
+            return like_given(x, whole if whole.dtype == real else whole.to(real))
 
         return (joined(0), joined(1)) if return_std else joined(0)
 
@@ -341,10 +353,12 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         dtype = x.dtype if x.dtype in (torch.float32, torch.float64) else torch.float64
         count = 1 if x.dim() == 1 else x.shape[0]
         outputs = y.shape[-1] if y.dim() == x.dim() else 1
-        self._streams_ = self._begin(count, outputs, torch.zeros(x.shape[-1], dtype=dtype, device=x.device))
+        with x.device:  # whatever the default device is
+            self._streams_ = self._begin(count, outputs, torch.zeros(x.shape[-1], dtype=dtype))
         self._shape_, self._targets_ = tuple(x.shape), tuple(y.shape)
         self._dtype_, self._device_ = dtype, x.device
         self._in_place_ = dtype if self._streams_.compiled else None
+        self._direct_ = self._streams_.direct(self._shape_, self._targets_)
         self.n_features_in_ = x.shape[-1]
         self.n_streams_ = None if x.dim() == 1 else count
         self.n_outputs_ = outputs if y.dim() == x.dim() else None
@@ -358,7 +372,8 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         if value.device != self._device_:
             rule = f"must be on {self._device_}, where the first sample was"
             raise ValueError(f"`{self._call(call)}({name}=...)` {rule}; got one on {value.device}.")
-        return value.to(self._streams_.dtype)
+        real = self._streams_.dtype
+        return value if value.dtype == real else value.to(real)
 
     def _refusal(self, call: str, x: Tensor, y: Tensor | None = None) -> ValueError:
         """Return the error of a sample whose shapes are not those of the first one."""
@@ -378,7 +393,9 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
 
     def _reset(self, streams: Any = None) -> None:
         if streams is not None:
-            self._fitted("reset")._streams_.clear(self._numbers("reset", streams))
+            rows = self._numbers("reset", streams)
+            with self._device_:
+                self._streams_.clear(rows)
             return
         for name in [name for name in vars(self) if name.endswith("_")]:
             delattr(self, name)
@@ -392,7 +409,9 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         call = self._call("add")
         if self._fitted("add").n_streams_ is None:
             raise ValueError(f"`{call}` needs streams side by side, x (S, n); this is a single one.")
-        self._streams_.add(integer(call, "streams", streams, least=1))
+        count = integer(call, "streams", streams, least=1)
+        with self._device_:
+            self._streams_.add(count)
         self._resized()
 
     def drop(self, streams: Any) -> Self:
@@ -406,7 +425,8 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         rows = every[~torch.isin(every, gone)]
         if self.n_streams_ is None or not len(rows):
             raise fail(self._call("drop"), "streams", "must leave a stream", streams)
-        self._streams_.keep(rows)
+        with self._device_:
+            self._streams_.keep(rows)
         self._resized(rows)
 
     def _resized(self, kept: Tensor | None = None) -> None:
@@ -414,6 +434,7 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         self.n_streams_ = self._streams_.count
         self._shape_ = (self._streams_.count, *self._shape_[1:])
         self._targets_ = (self._streams_.count, *self._targets_[1:])
+        self._direct_ = self._streams_.direct(self._shape_, self._targets_)
 
     @property
     def n_samples_seen_(self) -> Tensor:
@@ -484,7 +505,8 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         leading = () if streams is None else (streams,)
         x = torch.zeros(*leading, state["n_features_in_"], dtype=dtype, device="cpu")
         twin._prepare(x, x.new_zeros((*leading, *(() if outputs is None else (outputs,)))))
-        twin._streams_.load_state_dict(state)
+        with x.device:
+            twin._streams_.load_state_dict(state)
         self._change(self._take_over, twin, state)
         return self
 

@@ -97,6 +97,8 @@ class FilterStreams:
     def predict(self, x: Tensor, shape: tuple[int, ...] | None = None) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of the next y at x (S, n): (S, K), or in ``shape``."""
         if not self.scaling:
+            if isinstance(self._filter, CompiledFilter):
+                return self._filter.predict(self.state, x, shape)
             mean, deviation = self._filter.predict(self.state, x)
             return (mean, deviation) if shape is None else (mean.view(shape), deviation.view(shape))
         n = self.state.dim

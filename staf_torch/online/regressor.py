@@ -141,7 +141,9 @@ class StaFRegressor(StreamEstimator):
         states = turned_in_time(states, self._angles(states.shape[-1]))
         targets = values if values.dim() == states.dim() else values.unsqueeze(-1)
         rows = [part.unsqueeze(1) if states.dim() == 2 else part for part in (states, targets)]
-        self._change(self._hold, tuning(rows[0], rows[1], self._directions(states.shape[-1])))
+        with states.device:
+            found = tuning(rows[0], rows[1], self._directions(states.shape[-1]))
+        self._change(self._hold, found)
         return self
 
     def _hold(self, found: Tuning) -> None:
@@ -168,17 +170,14 @@ class StaFRegressor(StreamEstimator):
         streams = twin._streams_.inner if isinstance(twin._streams_, TurningStreams) else twin._streams_
         assert isinstance(streams, FilterStreams)
         rows = (len(states), streams.count, -1)
-        whole = (
-            torch.ones(rows[:2], dtype=torch.float64, device="cpu")
-            if steps is None
-            else steps.expand(rows[:2])
-        )
+        whole = states.new_ones(rows[:2], dtype=torch.float64) if steps is None else steps.expand(rows[:2])
         both = torch.cat((states.double().reshape(rows), values.double().reshape(rows)), -1)
         n, (center, spread) = states.shape[-1], streams.units_for(both)
         units = (both - center) / spread
-        mean, deviation = smooth_record(
-            streams.definition, streams.state, units[..., :n], units[..., n:], whole
-        )
+        with states.device:
+            mean, deviation = smooth_record(
+                streams.definition, streams.state, units[..., :n], units[..., n:], whole
+            )
         found = mean * spread[:, n:] + center[:, n:], deviation * spread[:, n:]
         return like_given(y, found[0].reshape(values.shape)), like_given(y, found[1].reshape(values.shape))
 
@@ -251,7 +250,7 @@ class StaFRegressor(StreamEstimator):
     def _resized(self, kept: Tensor | None = None) -> None:
         before = self.n_streams_ or 1
         super()._resized()
-        if self._tuning is not None:
+        if self._tuning is not None and len(self._tuning.center) == before:  # else it is of other streams
             new = self._streams_.count - before
             self._tuning = self._tuning.add(new) if kept is None else self._tuning.keep(kept)
 

@@ -87,7 +87,7 @@ class RiverRegressor:
                     f"{new!r}, which are left out: give all of them from the first sample on",
                     stacklevel=2,
                 )
-            self.model.partial_fit(row, torch.tensor(target, dtype=torch.float64))
+            self.model.partial_fit(row, torch.tensor(target, dtype=torch.float64, device="cpu"))
             self.features = names
         return self
 
@@ -114,7 +114,7 @@ def _row(call: str, x: Mapping[Any, float | None], names: tuple[Any, ...]) -> to
     if not isinstance(x, Mapping):
         raise fail(call, "x", "must be a dictionary of numbers by the names of features", x)
     numbers = [_number(call, f"x[{name!r}]", x.get(name)) for name in names]
-    return torch.tensor(numbers, dtype=torch.float64)
+    return torch.tensor(numbers, dtype=torch.float64, device="cpu")
 
 
 def _number(call: str, name: str, value: Any) -> float:

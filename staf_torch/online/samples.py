@@ -15,7 +15,8 @@ from ..numerics.checks import fail
 def tensor_of(call: str, name: str, value: Any) -> Tensor:
     """A tensor as it is; arrays and numbers as tensors; integers as float64."""
     if isinstance(value, Tensor):
-        refuse_gradient(call, **{name: value})
+        if value.requires_grad:
+            refuse_gradient(call, **{name: value})
         if value.is_nested or value.layout is not torch.strided or value.is_complex():
             kind = "nested" if value.is_nested else f"{value.layout}, {value.dtype}"
             raise ValueError(
@@ -31,14 +32,22 @@ def tensor_of(call: str, name: str, value: Any) -> Tensor:
                 array = array.astype(float)
             if np.iscomplexobj(array):
                 raise ValueError("Complex data not supported")
-            plain = array.flags.writeable and array.dtype.isnative and min(array.strides, default=0) >= 0
-            found = torch.as_tensor(array if plain else array.astype(array.dtype.newbyteorder("=")))
+            try:
+                found = _tensor(array if array.flags.writeable else array.copy())
+            except (TypeError, ValueError):  # it runs backwards, or has the bytes of another machine
+                found = _tensor(array.astype(array.dtype.newbyteorder("=")))
         except (TypeError, ValueError, RuntimeError) as error:
             kind = TypeError if hasattr(value, "toarray") or "convert" not in str(error) else ValueError
             kind = ValueError if isinstance(error, ValueError) else kind
             told = fail(call, name, "must be a tensor or an array of numbers", value)
             raise (ValueError if isinstance(value, str) else kind)(f"{told} {error}") from error
     return found if found.is_floating_point() else found.double()
+
+
+def _tensor(array: Any) -> Tensor:
+    if torch._C._len_torch_function_stack():  # perhaps of a default device, where arrays are not
+        return torch.as_tensor(array, device="cpu")
+    return torch.as_tensor(array)
 
 
 def in_place(value: Any, dtype: torch.dtype | None, shape: tuple[int, ...]) -> bool:

@@ -134,3 +134,15 @@ def test_a_lapse_that_is_no_time_is_refused(lapse: Any) -> None:
     rule = r"`StaFRegressor.partial_fit\(lapse=...\)` must be finite and not negative, \(\) or \(3,\);"
     with pytest.raises(ValueError, match=rule):
         st.StaFRegressor().partial_fit(torch.zeros(3, 2), torch.zeros(3), lapse=lapse)
+
+
+@over(REGRESSORS, "kind")
+def test_streams_are_where_their_samples_are_and_not_on_the_default_device(kind: str) -> None:
+    x, y = np.random.default_rng(0).standard_normal((2, 30, 2))
+    wanted = REGRESSORS[kind]().fit(x, y[:, 0]).partial_fit(x[0], y[0, 0]).predict(x[:3])
+    with torch.device("meta"):
+        model = REGRESSORS[kind]().fit(x, y[:, 0]).partial_fit(x[0], y[0, 0])
+        assert np.array_equal(model.predict(x[:3]), wanted)
+        several = REGRESSORS[kind]().fit(np.stack((x, x), 1), y)
+        several.add(1).drop([0]).reset(streams=[0]).load_state_dict(several.state_dict())
+        assert several.predict(x[:2]).shape == (2,)
