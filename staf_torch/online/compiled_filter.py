@@ -149,7 +149,7 @@ class DirectCalls:
         """Do nothing from now on."""
         self.filter.close(True)
 
-    def open(self) -> None:
+    def reopen(self) -> None:
         """Go on."""
         self.filter.close(False)
 

@@ -320,7 +320,7 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
             function(*given)
         finally:
             if self._direct_ is direct:  # else its streams are no longer these
-                direct.open()
+                direct.reopen()
 
     def _predict(self, x: Any, return_std: bool) -> Any:
         if in_place(x, self._in_place_, self._shape_):
