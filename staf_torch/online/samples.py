@@ -33,21 +33,15 @@ def tensor_of(call: str, name: str, value: Any) -> Tensor:
             if np.iscomplexobj(array):
                 raise ValueError("Complex data not supported")
             try:
-                found = _tensor(array if array.flags.writeable else array.copy())
+                found = torch.from_numpy(array if array.flags.writeable else array.copy())
             except (TypeError, ValueError):  # it runs backwards, or has the bytes of another machine
-                found = _tensor(array.astype(array.dtype.newbyteorder("=")))
+                found = torch.from_numpy(array.astype(array.dtype.newbyteorder("=")))
         except (TypeError, ValueError, RuntimeError) as error:
             kind = TypeError if hasattr(value, "toarray") or "convert" not in str(error) else ValueError
             kind = ValueError if isinstance(error, ValueError) else kind
             told = fail(call, name, "must be a tensor or an array of numbers", value)
             raise (ValueError if isinstance(value, str) else kind)(f"{told} {error}") from error
     return found if found.is_floating_point() else found.double()
-
-
-def _tensor(array: Any) -> Tensor:
-    if torch._C._len_torch_function_stack():  # perhaps of a default device, where arrays are not
-        return torch.as_tensor(array, device="cpu")
-    return torch.as_tensor(array)
 
 
 def in_place(value: Any, dtype: torch.dtype | None, shape: tuple[int, ...]) -> bool:
