@@ -18,9 +18,9 @@ def tensor_of(call: str, name: str, value: Any) -> Tensor:
         if value.requires_grad:
             refuse_gradient(call, **{name: value})
         if value.is_nested or value.layout is not torch.strided or value.is_complex():
-            kind = "nested" if value.is_nested else f"{value.layout}, {value.dtype}"
+            form = "nested" if value.is_nested else f"{value.layout}, {value.dtype}"
             raise ValueError(
-                f"`{call}({name}=...)` must be a dense tensor of real numbers; got one that is {kind}."
+                f"`{call}({name}=...)` must be a dense tensor of real numbers; got one that is {form}."
             )
         found = value.detach()
     else:
