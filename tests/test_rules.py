@@ -300,7 +300,10 @@ REFUSED: list[tuple[Callable[[], Any], str]] = [
     ),
     (lambda: adp.QuadraticCost(["no", 1.0], 1.0, 2, 1), "must be a list of numbers"),
     (lambda: adp.QuadraticCost(1.0, 1.0, 2, 1, target=[1.0]), "(target=...)` must have 2 numbers"),
-    (lambda: adp.QuadraticCost(1.0, 1.0, 2, 1, output=lambda x: x[0]), "(output=...)` must map (..., 2) to"),
+    (
+        lambda: adp.QuadraticCost(1.0, 1.0, 2, 1, output=lambda x: x[0]),
+        "output=...)` must map rows (5, 2)",
+    ),
     (
         lambda: adp.ActorCritic(adp.QuadraticBasis(2), PLANT, COST, POINTS, critic=TWO[0]),
         "`ActorCritic(critic=...)` must have 3 entries",

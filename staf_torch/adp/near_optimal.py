@@ -18,6 +18,7 @@ from ..lanes import ready, where_rows
 from ..lanes.gradients import marked, refuse_gradient, without_gradient
 from ..lanes.opaque import opaque
 from ..numerics.checks import choice, flag, integer, positive_real
+from ..numerics.default_device import beside
 from ..numerics.shown import shown, sizes
 from ..signs import Sign
 from ..systems import Plant
@@ -99,10 +100,12 @@ class NearOptimal(SampledRollout):
                 u: Tensor = self(x)
             return marked("near_optimal", self.lqr.layers, u)
         if self.memory is not None:
-            return self.memory(x.double()).to(x)  # type: ignore[no-any-return]
+            return self.memory(x)  # type: ignore[no-any-return]
         u, planner = super().forward(x), self.planner
         if planner is None:
             return u
+        if x.dtype != self.metric.dtype:
+            return self.forward(x.to(self.metric.dtype)).to(x.dtype)
         rows, controls = x.reshape(-1, x.shape[-1]), u.reshape(-1, u.shape[-1])
         return where_rows(planner.strained(rows), planner, rows, controls).view(u.shape)
 
@@ -155,6 +158,7 @@ class NearOptimal(SampledRollout):
         return self._planners[key]
 
     @Sign("policy.report()")
+    @beside
     @torch.no_grad()
     def report(
         self,
@@ -300,6 +304,7 @@ class NearOptimal(SampledRollout):
 @opaque
 @without_gradient("adp.near_optimal", "plant", "cost")
 @Sign("near_optimal")
+@beside
 def near_optimal(
     plant: Plant,
     cost: Cost,

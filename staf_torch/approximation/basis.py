@@ -158,7 +158,8 @@ class StaFBasis(nn.Module):
         if self.kernel.log_gain(x) is None:
             return 0.0
         reach = (x.norm(dim=-1) * self.centers.radius(x)).detach()
-        return float(torch.where(torch.isfinite(reach), reach, 0.0).max())
+        known = torch.where(torch.isfinite(reach), reach, 0.0)
+        return float(known.max()) if known.numel() else 0.0
 
     def warn_reach(self, worst: float, stacklevel: int = 2) -> bool:
         """`check_reach` where the largest |x| nu(x) is known."""

@@ -11,7 +11,9 @@ from torch import Tensor, nn
 
 from ..lanes.gradients import refuse_gradient
 from ..numerics.checks import choice, fail, flag, hold, integer, trailing
+from ..numerics.default_device import beside
 from ..numerics.linalg import row_jacobian
+from ..numerics.row_checks import check_target
 from .basis import StaFBasis, Target
 
 _MODES = ("partial", "total_frozen_weights", "total")
@@ -127,6 +129,7 @@ class StaF(nn.Module):
             )
         return w
 
+    @beside
     def fit_(self, x: Tensor, target: Target) -> StaF:
         """Move to the states x (..., n) and take the ideal coefficients of ``target`` there.
 
@@ -137,12 +140,14 @@ class StaF(nn.Module):
             ValueError: if x is not of the shape (*batch_shape, n), the target returns another shape, or one
                 requires a gradient; the module then stays as it was.
         """
-        trailing("StaF.fit_", "x", x, dims=1, last=self.basis.dim)
+        trailing("StaF.fit_", "x", x, dims=1, last=self.basis.dim, meta=False, vmap=False)
         if x.shape != self.state.shape:
             raise ValueError(
                 f"`StaF.fit_(x=...)` must have the shape {tuple(self.state.shape)}; got {tuple(x.shape)}."
             )
         refuse_gradient("StaF.fit_", x=x, target=target)
+        if x.numel():
+            check_target(target, x.reshape(-1, x.shape[-1])[0], self.out_features, sizes=x.shape)
         with torch.no_grad():
             x = _wide(x.to(self.state))
             self.basis.check_reach(x)

@@ -235,7 +235,10 @@ def policy_of(
     Raises:
         ValueError: if the controller is none of these, plans on the way, or carries a state.
     """
-    return _policy_of(controller, weights).to(dtype).eval().requires_grad_(False)
+    module = _policy_of(controller, weights).to(dtype)
+    if dtype != torch.float64:
+        module = in_dtype(module, dtype)  # also of policies that keep their precision
+    return module.eval().requires_grad_(False)
 
 
 def _policy_of(controller: Controller | nn.Module, weights: Tensor | None) -> nn.Module:

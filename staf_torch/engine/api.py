@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -141,7 +142,9 @@ def chase_weights(
     problem = Problem("chase_weights", basis, target, law, inner_steps, predictor)
     run: _ChaseRun | None = None
     recorded: list[Tensor] = []  # (B, C, M) a chunk
-    for piece in [states] if isinstance(states, Tensor) else states:
+    one = hasattr(states, "__array__") or not isinstance(states, Iterable)  # also what is refused
+    pieces: Iterable[Any] = [states] if one else states
+    for piece in pieces:
         problem.check_states(piece)
         run = _ChaseRun(problem, piece, weights, everything=False) if run is None else run
         for chunk in run.chunks(piece):

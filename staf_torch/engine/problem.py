@@ -10,6 +10,7 @@ from torch import Tensor
 from ..approximation.basis import StaFBasis, Target
 from ..lanes import each
 from ..numerics.checks import fail, integer, sampled, trailing
+from ..numerics.row_checks import check_target
 from ..optim.base import LawState, UpdateLaw
 from .predictors import Predictor
 
@@ -51,11 +52,14 @@ class Problem:
 
     def check_states(self, states: Tensor) -> None:
         """Refuse states that are not (B, T, n) with at least one of each."""
-        trailing(self.call, "states", states, dims=3, last=self.basis.dim)
+        trailing(self.call, "states", states, dims=3, last=self.basis.dim, meta=False, vmap=False)
         if states.dim() != 3 or 0 in states.shape:
             raise ValueError(
                 f"`{self.call}(states=...)` must have the shape (B, T, n); got {tuple(states.shape)}."
             )
+        if self.basis.centers.directions.is_meta:
+            raise fail(self.call, "basis", "must have its values: it was built on the meta device", None)
+        check_target(self.target, states[0, 0], sizes=(*states.shape, self.basis.count))
 
     def values(self, x: Tensor) -> Tensor:
         """Return V(c(x)) at the states x (..., n): (..., M)."""

@@ -19,7 +19,7 @@ from torch.autograd import forward_ad
 
 from ..signs import Sign
 from .compiler import compiled
-from .tree import Shared, Tree, flatten, plain, unflatten
+from .tree import Shared, Tree, flatten, labels, plain, unflatten
 
 LARGE = 2**22  # bytes from which pages of two megabytes are worth asking for
 _HUGE = 2**21
@@ -78,7 +78,8 @@ class Compiled(NamedTuple):
 def ordinary(leaves: Sequence[Any]) -> bool:
     """Return whether tensors are plain ones on the CPU of which nobody wants a derivative.
 
-    Under a tracer, a transform of torch.func or another mode the operations themselves are wanted.
+    All that is given to compiled code passes here: dense, of no subclass, without a pending sign. Under a
+    tracer, a transform of torch.func or another mode the operations themselves are wanted.
     """
     if (
         torch._C._functorch.peek_interpreter_stack() is not None
@@ -89,7 +90,12 @@ def ordinary(leaves: Sequence[Any]) -> bool:
     recorded = torch.is_grad_enabled()
     for leaf in leaves:
         tensor = plain(leaf)
-        if type(tensor) not in _TENSORS or not tensor.is_cpu or (recorded and tensor.requires_grad):
+        if (
+            type(tensor) not in _TENSORS
+            or not tensor.is_cpu
+            or (recorded and tensor.requires_grad)
+            or tensor.is_neg()
+        ):
             return False
     return True
 
@@ -233,6 +239,51 @@ def _parallel() -> int | None:
 _BINDING = ("OMP_PROC_BIND", "OMP_PLACES", "GOMP_CPU_AFFINITY")
 
 
+def whole(name: str, value: object, least: int) -> int:
+    """Return an argument of a program's call that must be an integer."""
+    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+        raise ValueError(f"`Program({name}=...)` must be an integer, at least {least}; got {value!r}.")
+    return value
+
+
+def _sizes(leaves: dict[str, list[Any]], structures: dict[str, Any]) -> tuple[int | None, int | None]:
+    """Return the numbers of rows and times of inputs, checked: all that compiled code reads by address.
+
+    Raises:
+        ValueError: that names the input which has no numbers in order here, or another size than the others.
+    """
+    sizes: dict[str, tuple[int, str]] = {}
+    device: tuple[torch.device, str] | None = None
+    for tree in ("carry", "now", "row"):
+        for label, leaf in zip(labels(structures[tree], tree), leaves[tree], strict=True):
+            shared, tensor = type(leaf) is Shared, plain(leaf)
+            name = f"`Program({tree}=...)`" + (f", its {label}," if label != tree else "")
+            if shared and tree == "carry":
+                raise ValueError(f"{name} must have rows; got a `Shared` tensor.")
+            if not isinstance(tensor, Tensor):
+                raise ValueError(f"{name} must be a tensor; got {type(tensor).__name__}.")
+            if tensor.is_nested or tensor.is_quantized or tensor.layout is not torch.strided:
+                kind = "nested" if tensor.is_nested else f"{tensor.layout}, {tensor.dtype}"
+                raise ValueError(f"{name} must be dense; got a tensor that is {kind}.")
+            if device is None:
+                device = tensor.device, name
+            elif tensor.device != device[0] and tensor.dim() > 0:
+                raise ValueError(
+                    f"{name} must be on {device[0]} like {device[1].rstrip(',')}; got one on {tensor.device}."
+                )
+            kinds = [] if shared else ["rows"]
+            kinds += ["times"] if tree == "now" else []
+            if tensor.dim() < len(kinds):
+                raise ValueError(
+                    f"{name} must begin with {' and '.join(kinds)}; got the shape {tuple(tensor.shape)}."
+                )
+            for kind, size in zip(kinds, tensor.shape, strict=False):
+                known, first = sizes.setdefault(kind, (size, name))
+                if known != size:
+                    raise ValueError(f"{name} must have {known} {kind} like {first.rstrip(',')}; got {size}.")
+    return sizes.get("rows", (None, ""))[0], sizes.get("times", (None, ""))[0]
+
+
 class Given(NamedTuple):
     """The inputs of a call as lists."""
 
@@ -248,17 +299,21 @@ class Given(NamedTuple):
         leaves, structures = {}, {}
         for name, tree in (("carry", carry), ("now", now), ("row", row)):
             leaves[name], structures[name] = flatten(tree)
-        own = [leaf for name in ("carry", "now", "row") for leaf in leaves[name] if isinstance(leaf, Tensor)]
-        if not own:
+            try:
+                hash(structures[name])
+            except TypeError as error:
+                rule = "must be a tree of tensors and numbers: write `torch.as_tensor` around an array"
+                raise ValueError(f"`Program({name}=...)` {rule}; {error}.") from error
+        rows, times = _sizes(leaves, structures)
+        if rows is None:
             raise ValueError(
                 "`Program(...)` must be given at least one tensor with a dimension of rows; got none."
             )
-        if leaves["now"]:
-            first = leaves["now"][0]
-            steps = len(first.tensor) if isinstance(first, Shared) else first.shape[1]
-        if steps is None:
-            raise ValueError("`Program(steps=...)` must be given where no input has times; got None.")
-        return cls(**leaves, structures=structures, rows=own[0].shape[0], times=steps)
+        if times is None:
+            if steps is None:
+                raise ValueError("`Program(steps=...)` must be given where no input has times; got None.")
+            times = whole("steps", steps, 0)
+        return cls(**leaves, structures=structures, rows=rows, times=times)
 
     @property
     def real(self) -> torch.dtype:

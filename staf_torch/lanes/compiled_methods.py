@@ -12,13 +12,14 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from types import CodeType, MethodType
 from typing import Any, Protocol, overload
 
 import torch
 from torch import Tensor, nn
 from torch.compiler import is_exporting
+from torch.utils import _device
 
 from ..signs import Sign
 from .call import PlannedCall, ordinary
@@ -172,9 +173,15 @@ class CompiledMethod:
     @opaque
     def __call__(self, x: Tensor, /, *more: Tree) -> Any:
         """y: (..., n) -> (..., m), or trees of (B, ...)."""
-        if not ordinary(flatten((x, *more))[0] if more else (x,)) or x.numel() == 0 or tracing_now():
-            return self._exported(x, *more) if is_exporting() else self.definition(x, *more)
+        try:
+            plain = not ordinary(flatten((x, *more))[0] if more else (x,)) or x.numel() == 0 or tracing_now()
+        except RuntimeError:  # a nested tensor has no size
+            plain = True
+        if plain:
+            return self._exported(x, *more) if is_exporting() else self._defined(x, *more)
         if self._served is None or _when == "never":
+            if not _is_state(x):
+                return self._refused(x, *more)
             rows = x.numel() / x.shape[-1]
             if not self._pays(rows):
                 return self._counted(rows, x, *more)
@@ -191,7 +198,11 @@ class CompiledMethod:
         if more:
             return served(x, *more)
         dims = x.dim()
-        y = served(x if dims <= 2 else x.reshape(-1, x.shape[-1]))
+        try:
+            y = served(x if dims <= 2 else x.reshape(-1, x.shape[-1]))
+        except (RuntimeError, ValueError):
+            self._refused(x)
+            raise
         return y.view(-1) if dims == 1 else y.reshape(*x.shape[:-1], y.shape[-1])
 
     def _exported(self, x: Tensor, *more: Tree) -> Any:
@@ -207,6 +218,22 @@ class CompiledMethod:
     def __code__(self) -> CodeType:
         """Of the definition, for `torch.export`."""
         return self.definition.__code__
+
+    def _defined(self, x: Tensor, *more: Tree) -> Any:
+        """Compute by the definition, with new tensors beside x whatever the default device is."""
+        if _device.CURRENT_DEVICE is None or not isinstance(x, Tensor):
+            return self.definition(x, *more)
+        with torch.device(x.device):
+            return self.definition(x, *more)
+
+    def _refused(self, x: Tensor, *more: Tree) -> Any:
+        """Raise what the definition says of x, or that no state is an integer, a flag or a single number."""
+        found = self.definition(x, *more)
+        if _is_state(x):
+            return found
+        name = f"{type(self.owner).__name__}.{self.definition.__name__}"
+        rule = "must be states (..., n) of floating point: write `.double()`"
+        raise ValueError(f"`{name}(x=...)` {rule}; got {tuple(x.shape)} of {x.dtype}.")
 
     def _pays(self, rows: float) -> bool:
         """Return whether the calls so far and this one repay a compiler: a large batch does by itself."""
@@ -224,9 +251,9 @@ class CompiledMethod:
         few = alone(int(rows) * ENTRIES)
         if self._plain is not None or not undecided() or self._settings.pays == math.inf:
             with few:
-                return self.definition(x, *more)
+                return self._defined(x, *more)
         with few, PlainTime() as plain:
-            found = self.definition(x, *more)
+            found = self._defined(x, *more)
         self._plain = plain, rows
         self._asked = max(self._asked, self._settings.pays * plain.seconds() / plain.build)
         return found
@@ -309,6 +336,17 @@ def methods_of(owner: Any) -> list[CompiledMethod]:
     ]
 
 
+def _is_state(x: Tensor) -> bool:
+    return x.is_floating_point() and x.dim() > 0
+
+
+def check_states(given: Sequence[Tensor]) -> None:
+    """Refuse states that are integers, flags or single numbers, when their form is new."""
+    for x in given:
+        if not _is_state(x):
+            raise ValueError(f"states must be (..., n) of floating point; got {tuple(x.shape)} of {x.dtype}.")
+
+
 class Rows:
     """y = function(a, b, ...), (B, ...) to (B, ...), where nobody traces or differentiates.
 
@@ -341,6 +379,7 @@ class Rows:
         plan = self._plans.get(key)
         if plan is not None:
             return plan(given)[0]
+        check_states(given)
         rows = [x.unsqueeze(0) if x.dim() == 1 else x for x in given]
         plan, found = self.planned(*rows)
         if plan is not None:

@@ -12,7 +12,7 @@ from torch import Tensor
 from ..signs import Sign
 from . import cache
 from .cache import Trace
-from .call import Compiled, Given, PlannedCall, form, ordinary
+from .call import Compiled, Given, PlannedCall, form, ordinary, whole
 from .compiler import machine_code
 from .contents import Contents, Derived
 from .emit.c import Names, c_text
@@ -137,9 +137,13 @@ class Program(Derived):
             return scan(lambda carry, now: self.step(carry, now, row), carry, now)
         self._look_around()
         leaves, structure = flatten((row, now, carry))
-        key = structure, tuple(map(form, leaves)), steps, every
         known = self._prepared  # of this step: another dictionary takes its place where that changes
-        prepared = known.get(key)
+        try:
+            key = structure, tuple(map(form, leaves)), steps, every
+            prepared = known.get(key)
+        except (RuntimeError, TypeError):  # something that is no tensor here, or not dense: this names it
+            Given.of(carry, now, row, steps)
+            raise
         if prepared is None:
             if len(known) >= _PREPARED:
                 known.clear()
@@ -383,12 +387,16 @@ class Prepared:
     """
 
     def __init__(self, program: Program, given: Given, every: int) -> None:
-        self._program, self._steps, self._every = program, given.times, every
+        self._program, self._steps, self._every = program, given.times, whole("every", every, 1)
         leaves, self._structure = flatten(given.trees())
         self._forms = tuple(map(form, leaves))
         self._carries, self._carry = len(given.carry), given.structures["carry"]
         self.plan: PlannedCall | None = None
         self._refused = given.rows == 0 or given.times == 0
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the parts of a copy, which finds its plan by itself."""
+        return {**vars(self), "plan": None}
 
     @opaque
     def __call__(self, carry: Tree, now: Tree = (), row: Tree = ()) -> tuple[Tree, Tree]:

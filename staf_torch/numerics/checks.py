@@ -137,22 +137,75 @@ def one_or_each(call: str, name: str, value: object, count: int) -> Tensor:
     return torch.tensor(numbers, dtype=torch.float64, device="cpu")
 
 
-def trailing(call: str, name: str, value: Tensor, dims: int, last: int | None = None) -> Tensor:
-    """A tensor with at least ``dims`` dimensions, the last of a stated size where one is stated."""
-    if not isinstance(value, Tensor):
-        raise fail(call, name, "must be a tensor", value)
-    if not value.is_floating_point():
-        raise fail(call, name, "must be a floating-point tensor", value)
-    if value.dim() < dims:
-        raise ValueError(
-            f"`{call}({name}=...)` must have at least {dims} dimensions; got the shape {tuple(value.shape)}."
-        )
-    if last is not None and value.shape[-1] != last:
-        raise ValueError(
-            f"`{call}({name}=...)` must have {last} entries in its last dimension; "
-            f"got the shape {tuple(value.shape)}."
-        )
-    return value
+_FLOATS, _DENSE = frozenset((torch.float64, torch.float32, torch.float16, torch.bfloat16)), torch.strided
+
+
+def trailing(
+    call: str,
+    name: str,
+    value: object,
+    dims: int,
+    last: int | None = None,
+    *,
+    meta: bool = True,
+    vmap: bool = True,
+) -> Tensor:
+    """The one rule of states and all that comes in rows: a floating-point tensor, dense, of the right size.
+
+    Numbers of another kind are never rounded or converted without a word: the error says what to write.
+
+    Args:
+        call: the door, and so is ``name`` its argument.
+        value: what was given.
+        dims: it must have at least.
+        last: size of its last dimension, where one is stated.
+        meta: whether a tensor without numbers will do.
+        vmap: whether one of `torch.func.vmap` will do.
+    """
+    if isinstance(value, Tensor):
+        if value.dtype not in _FLOATS or value.layout is not _DENSE:
+            raise _not_dense(call, name, value)
+        try:
+            shape = value.shape
+        except RuntimeError as error:
+            raise _not_dense(call, name, value) from error
+        if len(shape) < dims:
+            raise ValueError(
+                f"`{call}({name}=...)` must have at least {dims} dimension{'s' * (dims > 1)}; got the shape "
+                f"{tuple(shape)}."
+            )
+        if last is not None and shape[-1] != last:
+            raise ValueError(
+                f"`{call}({name}=...)` must have {last} entries in its last dimension; "
+                f"got the shape {tuple(shape)}."
+            )
+        if not meta and value.is_meta:
+            raise ValueError(f"`{call}({name}=...)` must have numbers; got a tensor on the device meta.")
+        if not vmap and torch._C._functorch.is_batchedtensor(value):
+            rule = "must hold all rows at once: they are alone here, and `torch.func.vmap` has no part in it"
+            raise ValueError(f"`{call}({name}=...)` {rule}; flatten its dimension into the rows.")
+        return value
+    write = "torch.as_tensor(x, dtype=torch.float64)"
+    if hasattr(value, "__array__") and hasattr(value, "dtype"):
+        got = f"an array {getattr(value, 'shape', '')} of {value.dtype}"
+    else:
+        got = show(value)
+        got = got if len(got) <= 80 else f"a {type(value).__name__}"
+    raise ValueError(f"`{call}({name}=...)` must be a tensor, as by `{write}`; got {got}.")
+
+
+def _not_dense(call: str, name: str, value: Tensor) -> ValueError:
+    """The error for numbers that are no floating point, or lie another way than one after the other."""
+    if value.is_nested:
+        return ValueError(f"`{call}({name}=...)` must be one dense tensor; got a nested one: stack its rows.")
+    if value.is_quantized:
+        return ValueError(f"`{call}({name}=...)` must be dense; got {value.dtype}: write `.dequantize()`.")
+    if value.dtype not in _FLOATS:
+        write = ".real.double()" if value.is_complex() else ".double()"
+        rule = f"must be a floating-point tensor and is {value.dtype}: write `{write}`"
+        dense = value.layout is torch.strided and not value.is_meta
+        return fail(call, name, rule, value if dense else None)
+    return ValueError(f"`{call}({name}=...)` must be dense; got {value.layout}: write `.to_dense()`.")
 
 
 def sampled(target: object, values: object, points: Tensor, outputs: int | None = None) -> Tensor:
@@ -167,6 +220,8 @@ def sampled(target: object, values: object, points: Tensor, outputs: int | None 
             f"The target `{name}` must map points of shape (..., n) to values of shape {form}: "
             f"{tuple(points.shape)} must give {expected}; got {tuple(values.shape)}."
         )
+    if not values.is_floating_point():
+        raise ValueError(f"The target `{name}` must return floating-point numbers; got {values.dtype}.")
     return values
 
 

@@ -18,7 +18,8 @@ from torch import Tensor
 from ..kernels import NAMED, Kernel
 from ..lanes.locks import ReadWriteLock
 from ..lanes.opaque import opaque
-from ..numerics.checks import choice, fail, integer
+from ..numerics.checks import choice, fail, integer, trailing
+from ..numerics.default_device import beside
 from ..signs import Sign
 from .compiled_filter import DirectCalls
 from .samples import in_place, lapse_of, lapses, like_given, pair, tensor_of
@@ -326,7 +327,7 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         if in_place(x, self._in_place_, self._shape_):
             mean, deviation = self._streams_.predict(x, self._targets_)
             return (mean, deviation) if return_std else mean
-        points = tensor_of(self._call("predict"), "x", x)
+        points = trailing(self._call("predict"), "x", tensor_of(self._call("predict"), "x", x), 1)
         own = 1 if self._fitted("predict").n_streams_ is None else 2
         several = points.dim() == own + 1
         if ((*points.shape[:-2], points.shape[-1]) if several else tuple(points.shape)) != self._shape_:
@@ -348,6 +349,7 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
 
         return (joined(0), joined(1)) if return_std else joined(0)
 
+    @beside
     def _prepare(self, x: Tensor, y: Tensor) -> None:
         """Infer the sizes from the first sample, check the arguments and begin the streams."""
         dtype = x.dtype if x.dtype in (torch.float32, torch.float64) else torch.float64

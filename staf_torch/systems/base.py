@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from ..numerics.angles import wrap
+from ..numerics.checks import trailing
 from ..numerics.shown import limits, settings, sizes
 from .bounds import Bounds
 
@@ -185,6 +186,7 @@ class ControlAffineSystem(Plant):
 
     def rate(self, x: Tensor, u: Tensor) -> Tensor:
         """x' = f(x) + g(x) u: (..., n), (..., m) -> (..., n)."""
+        trailing(type(self).__name__, "x", x, 1, self.dim)
         # Not a matrix product: a compiler fuses this where it would call a library for that.
         return self.drift(x) + (self.effectiveness(x) * u.unsqueeze(-2)).sum(-1)
 

@@ -20,7 +20,7 @@ Motion = Callable[..., Any]
 Slopes = Callable[[Any, Any], tuple[Any, Any]]
 """(x (n,), u (m,)) -> the derivatives with respect to x, (n, n), and u, (n, m), of NumPy arrays."""
 Numbers = np.ndarray[Any, np.dtype[np.float64]]
-_PROBES = 3  # rows that the function is tried with
+_PROBES = (3, 5, 7, 11)  # rows that the function is tried with: the first that is no other size, nor half
 _PUSHES = (1.0, 10.0, 100.0, 1000.0)  # of the inputs' tries, one after the other, until one moves the plant
 _KINK = 0.05  # of the largest slope, by which the slopes of two step sizes may differ
 
@@ -56,6 +56,8 @@ class BlackBox:
         self._call, self._function, self._slopes = call, function, slopes
         self._said = ""  # by the function, of tensors
         self._tensors = True  # whether it takes them
+        sizes = {len(x), len(u), len(x) + len(u)}
+        self._rows = next(count for count in _PROBES if not sizes & {count, 2 * count})
         self.torch = self._traces(x, u)
         self._try(x, u)
 
@@ -149,7 +151,7 @@ class BlackBox:
 
     def _traces(self, x: Tensor, u: Tensor) -> bool:
         """Return whether the function maps tensors to a tensor with a derivative, also under `torch.func`."""
-        z = torch.cat((x, u)).expand(_PROBES, -1).clone().requires_grad_()
+        z = torch.cat((x, u)).expand(self._rows, -1).clone().requires_grad_()
         try:
             with torch.enable_grad():
                 after = self._function(z[:, : len(x)], z[:, len(x) :])
@@ -170,17 +172,19 @@ class BlackBox:
     def _try(self, x: Tensor, u: Tensor) -> None:
         generator = torch.Generator().manual_seed(0)
         away = 0.1 * torch.randn(
-            _PROBES, len(x) + 2 * len(u), dtype=torch.float64, generator=generator, device="cpu"
+            self._rows, len(x) + 2 * len(u), dtype=torch.float64, generator=generator, device="cpu"
         )
         states, inputs = x + away[:, : len(x)], u + away[:, len(x) : len(x) + len(u)]
 
-        def pushed(size: float) -> tuple[tuple[Tensor, Tensor], Tensor]:
-            both = states.repeat(2, 1), torch.cat((inputs, inputs + size * away[:, -len(u) :]))
+        def asked(*rows: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:
             with torch.no_grad():
-                return both, self._function(*both) if self.torch else self._numpy(*both)
+                return rows, self._function(*rows) if self.torch else self._numpy(*rows)
+
+        def pushed(size: float) -> tuple[tuple[Tensor, ...], Tensor]:
+            return asked(states.repeat(2, 1), torch.cat((inputs, inputs + size * away[:, -len(u) :])))
 
         try:
-            both, after = pushed(1.0)
+            tried = pushed(1.0), asked(states, inputs)  # by two numbers of rows
         except Exception as error:
             kind = "as torch tensors" if self._tensors else "as NumPy arrays"
             said = f"; as torch tensors of float64 {self._said}" if self._said else ""
@@ -189,13 +193,14 @@ class BlackBox:
                 f"`{self._call}` raised {_shown(error)} at x and u of the shapes {tuple(states.shape)} and "
                 f"{tuple(inputs.shape)}, {kind}{said}. It must map rows to rows.{hint}"
             ) from error
-        if not isinstance(after, Tensor) or after.shape != both[0].shape:
-            got = tuple(after.shape) if isinstance(after, Tensor) else type(after).__name__
-            raise ValueError(
-                f"`{self._call}` must map x and u of the shapes {tuple(both[0].shape)} and "
-                f"{tuple(both[1].shape)} to {tuple(both[0].shape)}; got {got}."
-            )
-        if not bool(torch.isfinite(after).all()):
+        for rows, after in tried:
+            if not isinstance(after, Tensor) or after.shape != rows[0].shape:
+                got = tuple(after.shape) if isinstance(after, Tensor) else type(after).__name__
+                raise ValueError(
+                    f"`{self._call}` must map x and u of the shapes {tuple(rows[0].shape)} and "
+                    f"{tuple(rows[1].shape)} to {tuple(rows[0].shape)}; got {got}."
+                )
+        if not bool(torch.isfinite(tried[0][1]).all()):
             raise ValueError(f"`{self._call}` returned values that are not finite near x = {x.tolist()}.")
         # What sticks is moved by a large input alone.
         if all(_same(pushed, size) for size in _PUSHES):

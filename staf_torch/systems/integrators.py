@@ -15,6 +15,7 @@ from ..lanes.loop_program import LoopProgram
 from ..lanes.opaque import opaque
 from ..lanes.tree import Tree
 from ..numerics.checks import integer, positive_real, trailing
+from ..numerics.default_device import beside
 from ..numerics.exponential_step import BENT, GRACE, MOST, TOLERANCE, TRIED, needed_steps
 from ..numerics.runge_kutta import runge_kutta_mean, runge_kutta_stages
 from ..signs import Sign
@@ -55,7 +56,7 @@ def trajectory(
     Raises:
         ValueError: if an argument breaks its rule, or the plant returns another shape.
     """
-    trailing("trajectory", "x0", x0, dims=2, last=getattr(system, "dim", None))
+    trailing("trajectory", "x0", x0, dims=2, last=getattr(system, "dim", None), meta=False, vmap=False)
     positive_real("trajectory", "dt", dt)
     total = integer("trajectory", "steps", steps, least=0) + 1
     size = total if chunk is None else integer("trajectory", "chunk", chunk, least=1)
@@ -165,6 +166,7 @@ def _refined(
 
 @opaque
 @Sign("systems.simulate")
+@beside
 def simulate(system: ControlAffineSystem, x0: Tensor, *, dt: float, steps: int) -> Tensor:
     """The whole of `trajectory` at once: (B, n) -> (B, steps + 1, n).
 

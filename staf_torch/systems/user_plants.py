@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ..numerics.checks import fail, integer, numbers_of, positive_real, vector
+from ..numerics.default_device import beside
 from .base import Linearisation, Plant
 from .black_box import BlackBox, Motion, Slopes
 from .bounds import Bounds, Limit
@@ -23,6 +24,7 @@ Guess = Sequence[float] | Tensor | tuple[Sequence[float] | Tensor, Sequence[floa
 class FunctionPlant(Plant):
     """Base of `StepPlant` and `RatePlant`: the function, its equilibrium, its linearisation."""
 
+    @beside
     def __init__(
         self,
         argument: str,

@@ -102,10 +102,13 @@ def test_a_kink_of_a_twentieth_of_the_largest_slope_is_one(bend: float, smooth: 
     ("function", "message"),
     [
         (None, r"`T\(f\)` must be a function of x \(B, n\) and u \(B, m\); got None"),
-        (lambda x, u: [1.0], r"must map x and u of the shapes \(6, 2\) and \(6, 1\) to \(6, 2\); got \(1,\)"),
+        (
+            lambda x, u: [1.0],
+            r"must map x and u of the shapes \(10, 2\) and \(10, 1\) to \(10, 2\); got \(1,\)",
+        ),
         (
             lambda x, u: 1 / 0,
-            r"raised ZeroDivisionError \(division by zero\) at x and u of the shapes \(3, 2\)",
+            r"raised ZeroDivisionError \(division by zero\) at x and u of the shapes \(5, 2\)",
         ),
         (lambda x, u: (_ for _ in ()).throw(KeyError()), r"raised KeyError \(\)"),
         (lambda x, u: x + np.inf * u, r"not finite near x = \[0.0, 0.0\]"),

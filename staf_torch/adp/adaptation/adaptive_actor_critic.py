@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ...numerics.checks import fail, positive_real
+from ...numerics.checks import fail, positive_real, trailing
 from ...numerics.rows import chosen
 from ...systems.two_state_tracking import TwoStateTracking, feedforward, parametric_drift, regressor
 from ..critic.actor_critic import ActorCritic
@@ -111,6 +111,7 @@ class AdaptiveActorCritic(Controller):
         return other
 
     def init(self, x0: Tensor) -> LearnedModel:
+        trailing(type(self).__name__, "x0", x0, 2)
         estimate = self.law.init(x0)
         if self.known is not None:
             pairs = zip(self.known[:-1], estimate[:-1], strict=True)  # all but what was missed
@@ -214,6 +215,7 @@ class IdentifyingTracker(Controller):
         self.first: Tensor
 
     def init(self, x0: Tensor) -> Identifying:
+        trailing(type(self).__name__, "x0", x0, 2)
         first = self.first.to(x0).repeat(len(x0), 1, 1)
         held = x0.new_zeros(len(x0), self.plant.inputs)
         return Identifying(

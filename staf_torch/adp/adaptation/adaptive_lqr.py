@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ...numerics.checks import fail, non_negative, positive_real, real
+from ...numerics.checks import fail, non_negative, positive_real, real, trailing
 from ...numerics.riccati import product
 from ...numerics.rows import chosen
 from ..loop.controller import LQR, Controller, Policy
@@ -120,6 +120,7 @@ class AdaptiveLQR(Controller):
         return other
 
     def init(self, x0: Tensor) -> Adaptation:
+        trailing(type(self).__name__, "x0", x0, 2)
         zero, filter = x0.new_zeros(len(x0)), self.filter
         estimate, window = self.law.init(x0, self.theta), self.windows.init(x0)
         belief = None if filter is None else filter.init(x0)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ...kernels import Kernel
-from ...numerics.checks import fail, non_negative, positive_real, real
+from ...numerics.checks import fail, non_negative, positive_real, real, trailing
 from ...numerics.linalg import row_jacobian
 from ...numerics.pivoted_cholesky import newton_basis
 from ...numerics.riccati import measured, product
@@ -301,6 +301,7 @@ class DriftLQR(Controller):
         self.robust: Policy = LQR(drift.known, cost) if robust is None else robust
 
     def init(self, x0: Tensor) -> DriftAdaptation:
+        trailing(type(self).__name__, "x0", x0, 2)
         window, p = self.drift.windows.init(x0), x0.new_zeros(*x0.shape, x0.shape[-1])
         window = self.drift.windows.holding(window, self.cost.input_of(window.u))
         return DriftAdaptation(self.drift.init(x0), x0.new_zeros(len(x0)), window, p)

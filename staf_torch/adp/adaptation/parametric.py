@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ...numerics.checks import copied, fail, integer, number
+from ...numerics.row_checks import check_rows
 from ...systems import Barrier, Bounds, ControlAffineSystem
 from ..problem.cost import Cost
 
@@ -206,6 +207,8 @@ class ParametricPlant(ControlAffineSystem):
             ("known", self.rest_of, tuple(x.shape)),
         ):
             got = of(x, u)
+            if not self.theta.shape[:-1] and isinstance(got, Tensor) and tuple(got.shape) == shape:
+                check_rows(f"ParametricPlant({name}=...)", of, [x[0], u[0]], shape[1:], sizes=(4,))
             if not isinstance(got, Tensor) or tuple(got.shape) != shape:
                 shown = tuple(got.shape) if isinstance(got, Tensor) else got
                 raise fail("ParametricPlant", name, f"must map {tuple(x.shape)} to {shape}", shown)

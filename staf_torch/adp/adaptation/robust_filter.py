@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ...lanes.tree import flatten, unflatten
-from ...numerics.checks import fail, positive_real, vector
+from ...numerics.checks import fail, positive_real, trailing, vector
 from ...numerics.rows import chosen
 from ..loop.controller import Carried, Controller
 from ..safety.conditions import Constraint, listed
@@ -113,7 +113,7 @@ class RobustFilter(Controller):
             raise fail("RobustFilter", "theta_low", rule, theta_low)
         self.confidence = positive_real("RobustFilter", "confidence", confidence)
         self.controller, self.plant, self.windows, self.law = controller, plant, windows, law
-        several = listed("RobustFilter", constraints)
+        several = listed("RobustFilter", constraints, plant)
 
         def of_states(h: Constraint) -> Constraint:
             return lambda z, t: h(z[:, :n], t)  # of the plant's states alone
@@ -130,6 +130,7 @@ class RobustFilter(Controller):
         self.period, self.draws = dt, controller.draws
 
     def init(self, x0: Tensor) -> Guarded:
+        trailing(type(self).__name__, "x0", x0, 2)
         zero, inner = x0.new_zeros(len(x0)), self.controller.init(x0)
         estimate, window = self.law.init(x0), self.windows.init(x0)
         return Guarded(inner, estimate, window, zero, torch.full_like(zero, _FAR), zero.clone(), zero.clone())

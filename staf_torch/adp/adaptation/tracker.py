@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ...numerics.angles import wrap
-from ...numerics.checks import choice, fail
+from ...numerics.checks import choice, fail, trailing
 from ..loop.controller import Controller
 from .history_stack import ConcurrentGradient, HistoryStack, Stack
 from .parametric import ParametricPlant
@@ -111,6 +111,7 @@ class ConcurrentTracker(Controller):
         )
 
     def init(self, x0: Tensor) -> Tracking:
+        trailing(type(self).__name__, "x0", x0, 2)
         feedback, gain, rate, length = (g.to(x0).expand(len(x0)).clone() for g in self.gains)
         theta = self.first.to(x0).expand(len(x0), -1).clone()
         return Tracking(theta, feedback, gain, rate, self.windows.init(x0, length), self.stack.init(x0))

@@ -96,6 +96,7 @@ class ActorCritic(Controller):
         return f"actor-critic ({type(self.law).__name__})"
 
     def init(self, x0: Tensor) -> Weights:
+        trailing(type(self).__name__, "x0", x0, 2)
         rows = (x0.shape[0], self.basis.count)
         one = torch.eye(self.basis.count, dtype=x0.dtype, device=x0.device)
         gain = self.gain.to(x0)[..., None, None] * one

@@ -8,9 +8,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ...numerics.checks import trailing
 from ...numerics.linalg import slope_of
 from ...systems import ControlAffineSystem
 from ..problem.cost import Cost, matvec
+from ..problem.shapes import check_value
 from .bases import ValueBasis
 
 
@@ -48,6 +50,8 @@ def hjb_residual(
 
     Source: MATH.md section 4; for a quadratic cost x'Qx + f'grad V - 1/4 grad V' g R^-1 g' grad V.
     """
+    trailing("hjb_residual", "x", x, 1, cost.dim)
+    check_value("hjb_residual", "value", value, cost)
     gradient = value_gradient(value, x)
     g = system.effectiveness(x)
     u = cost.policy(g, gradient)

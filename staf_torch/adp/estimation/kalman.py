@@ -11,9 +11,10 @@ import torch
 from torch import Tensor
 
 from ...numerics.angles import periods_of, wrap_each
-from ...numerics.checks import fail, non_negative, one_or_each, positive, real, vector
+from ...numerics.checks import fail, non_negative, one_or_each, positive, real, trailing, vector
 from ...numerics.linalg import row_jacobian
 from ...numerics.riccati import measured, product
+from ...numerics.row_checks import check_rows
 from ...systems import Plant
 from ..loop.controller import Carried, Controller
 from ..problem.cost import Output, matvec
@@ -68,6 +69,7 @@ class KalmanFilter(abc.ABC):
         if tuple(seen.shape) != (1, len(noise)):
             raise fail(name, "output", f"must map (1, {n}) to (1, {len(noise)})", tuple(seen.shape))
         q = len(noise)
+        check_rows(f"{name}(output=...)", output, [torch.zeros(n, dtype=torch.float64)], (q,))
         if not set(periodic) <= set(range(-q, q)):
             raise fail(name, "periodic", f"must be places of {q} outputs", list(periodic))
         angles = {index % q for index in periodic}
@@ -277,6 +279,7 @@ class Observed(Controller):
         return f"{self.controller.label} of observed states"
 
     def init(self, x0: Tensor) -> Observing:
+        trailing(type(self).__name__, "x0", x0, 2)
         rows, n, m = len(x0), len(self.guess), self.filter.model.inputs
         covariance = torch.diag(self.deviation.to(x0).square()).expand(rows, n, n).clone()
         mean = self.guess.to(x0).expand(rows, n).clone()

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ...numerics.checks import fail
+from ...numerics.checks import fail, trailing
 from ..loop.controller import Carried, Controller
 from ..problem.cost import Output
 
@@ -75,6 +75,7 @@ class Measured(Controller):
         return x[..., : self.dim] if self.output is None else self.output(x)
 
     def init(self, x0: Tensor) -> Carried:
+        trailing(type(self).__name__, "x0", x0, 2)
         return self.controller.init(self.seen(x0))
 
     def recorded(self, carried: Carried) -> dict[str, Tensor]:

@@ -12,7 +12,8 @@ from torch.nn.functional import pad
 
 from ...lanes.contents import is_users, version
 from ...lanes.gradients import gradients_of, marked
-from ...numerics.checks import copied, real
+from ...numerics.checks import copied, real, trailing
+from ...numerics.default_device import beside
 from ...numerics.linalg import riccati
 from ...numerics.shown import limits, shown
 from ...systems import Plant
@@ -217,6 +218,7 @@ class LQR(nn.Module):
             holds a tensor that requires a gradient, other than a network's.
     """
 
+    @beside
     def __init__(self, system: Plant, cost: Cost, period: float | None = None) -> None:
         super().__init__()
         self.layers = gradients_of("LQR", system=system, cost=cost)
@@ -237,10 +239,13 @@ class LQR(nn.Module):
         self.register_buffer("k", k)
         self.p: Tensor
         self.k: Tensor
+        self._size = k.shape[-1]
 
     def forward(self, x: Tensor) -> Tensor:
         """u: (..., n) -> (..., m)."""
-        u = self.cost.saturate(self.cost.input_of(-matvec(self.k, self.cost.deviation(x))))
+        trailing("LQR", "x", x, 1, self._size)
+        cost = self.cost
+        u = cost.saturate(cost.input_of(-matvec(self.k, cost.deviation(x))))
         return marked("LQR", self.layers, u) if self.layers else u
 
     def __repr__(self) -> str:
@@ -250,6 +255,7 @@ class LQR(nn.Module):
 
     def value(self, x: Tensor) -> Tensor:
         """e'Pe: (..., n) -> (...)."""
+        trailing("LQR.value", "x", x, 1, self._size)
         paid = quadratic(self.p, self.cost.deviation(x))
         return marked("LQR", self.layers, paid) if self.layers else paid
 

@@ -21,13 +21,16 @@ from ...lanes.opaque import opaque
 from ...lanes.tree import flatten, unflatten
 from ...numerics.angles import wrap
 from ...numerics.checks import choice, copied, fail, integer, positive_real, trailing
+from ...numerics.default_device import beside
 from ...numerics.exponential_step import BENT
+from ...numerics.row_checks import is_ours
 from ...results import pictures
 from ...signs import Sign
 from ...systems import ControlAffineSystem, Plant
 from ..problem.cost import Cost
 from ..problem.held_plant import RESOLVED, Holding, Substeps, fewest_and_most
 from ..problem.rules import warn_if_restless, warn_if_unstable
+from ..problem.shapes import check_problem
 from .accuracy import hardest, needed, warn_of_errors, warn_of_models
 from .controller import Carried, Controller, Feedback, Policy
 from .picture import LoopAbout, picture, summary
@@ -154,6 +157,7 @@ _OF_ROWS = ("state", "control", "running_cost", "recorded", "frozen_at", "carrie
 
 @opaque
 @without_gradient("adp.simulate", "controller", "system", "cost", "x0")
+@beside
 def simulate(
     controller: Controller | Policy,
     system: Plant,
@@ -227,6 +231,7 @@ def simulate(
     fastest = math.inf
     if isinstance(controller, Feedback) and x0.device.type == "cpu":
         controller.check(x0)
+        _check_control(controller, x0, cost.inputs)
         fastest = warn_if_unstable(controller.policy, system, cost, positive_real("simulate", "dt", dt))
     # Of slow plants one step is tried, as rows that are fast elsewhere run again.
     tried = 1 if substeps is None and fastest * dt <= RESOLVED else substeps
@@ -267,6 +272,20 @@ def simulate(
 
     about = LoopAbout.of(controller, system, loop.cost, None if renew else dt, again)
     return dataclasses.replace(result, about=about)
+
+
+def _check_control(controller: Feedback, x0: Tensor, inputs: int) -> None:
+    """Refuse a policy that is not one control a row; numbers of a row's own are its matter."""
+    if is_ours(controller.policy):
+        return
+    with torch.no_grad():
+        u = controller.policy(x0)
+    whole = (len(x0), inputs)
+    fits = isinstance(u, Tensor) and u.is_floating_point() and u.dim() in (1, 2)
+    if not fits or any(size not in (1, w) for size, w in zip(u.shape, whole[-u.dim() :], strict=True)):
+        got = f"{tuple(u.shape)} of {u.dtype}" if isinstance(u, Tensor) else type(u).__name__
+        rule = f"must map states {tuple(x0.shape)} to controls {(len(x0), inputs)} of floating point"
+        raise ValueError(f"`simulate(controller=...)` {rule}; got {got}.")
 
 
 def _beginning(loop: ClosedLoop, plain: Program, steps: int) -> LoopProgram:
@@ -334,7 +353,10 @@ class _LoopRun:
         alone = not row_numbers(loop)
         try:
             other, _ = (some if alone else whole).of(loop)
-        except (RuntimeError, ValueError):  # the controller has numbers of all rows
+            known = len(other.state) == (len(rows) if alone else len(self.x0))
+        except (RuntimeError, ValueError):
+            known = False
+        if not known:  # the controller has numbers of all rows
             alone = False
             other, _ = whole.of(loop)
         kept, structure = flatten([getattr(result, name) for name in _OF_ROWS])
@@ -399,7 +421,7 @@ def uniform_numbers(x0: Tensor, count: int, draws: int, generators: Sequence[tor
 
 def _check(system: Plant, cost: Cost, x0: Tensor) -> Cost:
     """Return the cost around the plant, once all shapes are right."""
-    trailing("simulate", "x0", x0, dims=2, last=system.dim)
+    trailing("simulate", "x0", x0, dims=2, last=system.dim, meta=False, vmap=False)
     if x0.dim() != 2 or x0.shape[0] == 0:
         raise ValueError(f"`simulate(x0=...)` must have the shape (B, n); got {tuple(x0.shape)}.")
     name, size, inputs = type(system).__name__, x0.shape[1], cost.inputs
@@ -414,6 +436,7 @@ def _check(system: Plant, cost: Cost, x0: Tensor) -> Cost:
                 f"`{name}.{method}` must map {tuple(x0.shape)} to {tuple(shape)} "
                 f"(the cost is for {inputs} inputs); got {got}."
             )
+    check_problem(system, cost)
     placed = cost.around(system)
     warn_if_restless("simulate", system, placed)
     return placed

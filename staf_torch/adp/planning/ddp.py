@@ -20,9 +20,10 @@ from ...lanes import Program, repeat, scan, traced_as
 from ...lanes.gradients import without_gradient
 from ...lanes.one_thread import alone
 from ...lanes.opaque import opaque
-from ...lanes.tree import Tree
+from ...lanes.tree import Tree, flatten, unflatten
 from ...numerics.box import minimum_and_slopes
 from ...numerics.checks import fail, integer, positive_real, trailing
+from ...numerics.default_device import beside
 from ...numerics.riccati import riccati_step
 from ...signs import Sign
 from ..problem.sampled import Derivatives, SampledProblem
@@ -108,6 +109,7 @@ class BoxDDP:
     @opaque
     @without_gradient("BoxDDP.solve", "x0", "control", "reference", "terminal", "self")
     @Sign("BoxDDP")
+    @beside
     def solve(
         self,
         x0: Tensor,
@@ -129,8 +131,12 @@ class BoxDDP:
             ValueError: if a shape is wrong.
         """
         n, m = self.problem.dim, self.problem.inputs
-        if trailing("BoxDDP.solve", "x0", x0, 2, n).dim() != 2:
+        if trailing("BoxDDP.solve", "x0", x0, 2, n, meta=False, vmap=False).dim() != 2:
             raise fail("BoxDDP.solve", "x0", f"must have the shape (B, {n})", tuple(x0.shape))
+        real = self.problem.goal.dtype
+        if x0.dtype != real:
+            given, shape = flatten((x0, control, reference, terminal))
+            return self.solve(*unflatten(shape, iter([each.to(real) for each in given]))).to(x0.dtype)
         expected = (len(x0), self.steps, m)
         if control is None and self.problem.unregulated:
             return self._best_of_several(x0, terminal)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ...lanes import compiled, repeat, scan, traced_as
 from ...numerics.box import LARGEST, minimum_and_slopes
-from ...numerics.checks import fail, integer, positive_real
+from ...numerics.checks import fail, integer, positive_real, trailing
 from ...numerics.forward_mode import use_forward_mode
 from ...numerics.linalg import row_jacobian
 from ...numerics.riccati import product, riccati_step
@@ -310,6 +310,7 @@ class DetourPlans(Controller):
 
     def init(self, x0: Tensor) -> CarriedPlan:
         """The best of the first plans from the states x0 (B, n), some 200 of each."""
+        x0 = trailing(type(self).__name__, "x0", x0, 2).to(self.detours.margin.dtype)
         count, starts = len(x0), self._starts(x0)
         x, found = x0.repeat(len(starts), 1), starts.flatten(0, 1).flatten(1)
         for _ in range(self.first):
@@ -325,9 +326,10 @@ class DetourPlans(Controller):
         if dt != self.hold:
             raise fail("DetourPlans", "dt", f"must be that of the loop, {dt:g} s", self.hold)
         control = carried.control
-        found = self._next(torch.cat((x, control.flatten(1), carried.expected, carried.done), dim=-1))
+        at = trailing("DetourPlans.step", "x", x, 2).to(self.detours.margin.dtype)
+        found = self._next(torch.cat((at, control.flatten(1), carried.expected, carried.done), dim=-1))
         u, ahead, *rest = found.split((control.shape[-1], control[0].numel(), 1, 1), dim=-1)
-        return u, CarriedPlan(ahead.unflatten(-1, control.shape[1:]), *rest)
+        return u.to(x.dtype), CarriedPlan(ahead.unflatten(-1, control.shape[1:]), *rest)
 
     def _check_others(self) -> None:
         """Raise where the moved states or the inputs change how another state moves."""

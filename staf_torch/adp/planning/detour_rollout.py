@@ -10,7 +10,16 @@ import torch
 from torch import Tensor
 
 from ...lanes import compiled, each, repeat
-from ...numerics.checks import fail, integer, non_negative, one_or_each, positive, positive_real, vector
+from ...numerics.checks import (
+    fail,
+    integer,
+    non_negative,
+    one_or_each,
+    positive,
+    positive_real,
+    trailing,
+    vector,
+)
 from ...systems import Plant
 from ..loop.controller import Controller, Policy, Value
 from ..problem.cost import Cost
@@ -100,7 +109,7 @@ class DetourRollout(Controller):
         super().__init__()
         check_traceable("DetourRollout", plant)
         self.policy, self.plant, self.terminal, self.cost = policy, plant, terminal, cost.around(plant)
-        self.constraints = listed("DetourRollout", constraints)
+        self.constraints = listed("DetourRollout", constraints, plant)
         along = torch.as_tensor(axes, dtype=torch.float64, device=getattr(axes, "device", "cpu"))
         fits = along.dim() == 2 and along.shape[1] == cost.dim and 1 <= len(along) <= _AXES
         if not fits or not bool(torch.isfinite(along).all()):
@@ -129,14 +138,16 @@ class DetourRollout(Controller):
         self.holding = Holding("DetourRollout", plant, self.cost, self.stride * self.hold)
 
     def init(self, x0: Tensor) -> Detour:
+        x0 = trailing(type(self).__name__, "x0", x0, 2).to(self.margin.dtype)
         return Detour(x0.new_zeros(len(x0), len(self.axes) + 1), x0.new_zeros(len(x0), 1))
 
     def step(self, x: Tensor, carried: Detour, uniform: Tensor, dt: float) -> tuple[Tensor, Detour]:
         if dt != self.hold:
             raise fail("DetourRollout", "dt", f"must be that of the loop, {dt:g} s", self.hold)
-        found = self._chosen(torch.cat((x, *carried), dim=-1))
+        at = trailing("DetourRollout.step", "x", x, 2).to(self.margin.dtype)
+        found = self._chosen(torch.cat((at, *carried), dim=-1))
         u, way, done = found.split((self.plant.inputs, carried.way.shape[-1], 1), dim=-1)
-        return u, Detour(way, done)
+        return u.to(x.dtype), Detour(way, done)
 
     @compiled("a choice of detours")
     def _chosen(self, z: Tensor) -> Tensor:

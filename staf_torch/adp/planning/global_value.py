@@ -8,11 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ...lanes import Program, scan
 from ...lanes.gradients import without_gradient
 from ...numerics.checks import fail, integer, positive_real, trailing, vector
+from ...numerics.kept_precision import KeptPrecision
 from ..problem.rules import check_endless, check_regulator
 from ..problem.sampled import SampledProblem
 from .trajectories import LocalModel, Reference, Trajectories, around, packed, resting, unpacked
@@ -42,7 +43,7 @@ class Choice(NamedTuple):
     covered: Tensor  # whether it ends near what it follows, (B,) bool
 
 
-class GlobalValue(nn.Module):
+class GlobalValue(KeptPrecision):
     """V(x) = min_j [cost of following trajectory j from its state nearest to x, for ``lookahead`` steps,
     + V_j at the end],  V_j(y) = v_j + g_j'd + d'H_j d / 2,  d = y - x_j.
 
@@ -150,6 +151,9 @@ class GlobalValue(nn.Module):
     @without_gradient("GlobalValue", "x")
     def forward(self, x: Tensor) -> Tensor:
         """u: (..., n) -> (..., m)."""
+        trailing("GlobalValue", "x", x, 1, self.problem.dim)
+        if x.dtype != self.plans.dtype:
+            return self.forward(x.to(self.plans.dtype)).to(x.dtype)
         rows = x if x.dim() == 2 else x.reshape(-1, x.shape[-1])
         if len(rows) == 1:
             entries = self.nearest(rows)[0]
@@ -171,13 +175,14 @@ class GlobalValue(nn.Module):
     def value(self, x: Tensor) -> Tensor:
         """V(x), inf where no plan covers x: (..., n) -> (...)."""
         trailing("GlobalValue.value", "x", x, 1, self.problem.dim)
-        found = self.choose(x.reshape(-1, x.shape[-1]))
-        return torch.where(found.covered, found.value, torch.inf).reshape(x.shape[:-1])
+        found = self.choose(x.reshape(-1, x.shape[-1]).to(self.plans.dtype))
+        return torch.where(found.covered, found.value, torch.inf).reshape(x.shape[:-1]).to(x.dtype)
 
     def gradient(self, x: Tensor) -> Tensor:
         """g_j + H_j d of the model that the best candidate starts at: (..., n) -> (..., n)."""
-        rows = x.reshape(-1, x.shape[-1])
-        return self.model(rows).slope(self.problem, rows).reshape(x.shape)
+        trailing("GlobalValue.gradient", "x", x, 1, self.problem.dim)
+        rows = x.reshape(-1, x.shape[-1]).to(self.plans.dtype)
+        return self.model(rows).slope(self.problem, rows).reshape(x.shape).to(x.dtype)
 
     def model(self, x: Tensor) -> LocalModel:
         """The remembered model that the best candidate starts from, at every state: (B, n)."""

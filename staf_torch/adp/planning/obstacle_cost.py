@@ -11,10 +11,12 @@ import torch
 from torch import Tensor
 
 from ...numerics.checks import choice, fail, integer, positive_real
+from ...numerics.row_checks import check_rows
 from ...signs import Sign
 from ...systems import Plant
 from ..problem.cost import Matrix, QuadraticCost
 from ..problem.sampled import SampledProblem
+from ..problem.shapes import state_of
 from .ddp import BoxDDP
 from .trajectories import Reference, Trajectories, chosen, rows_of
 
@@ -71,6 +73,9 @@ class AvoidanceCost(QuadraticCost):
         self.obstacles = [obstacles] if callable(obstacles) else list(obstacles)
         if not self.obstacles or not all(map(callable, self.obstacles)):
             raise fail("AvoidanceCost", "obstacles", "must be h(x) or a list of them", obstacles)
+        for k, h in enumerate(self.obstacles):
+            what = f"AvoidanceCost(obstacles=...)` number {k} `h(x)"
+            check_rows(what, h, [state_of(self)], sizes=(inputs, len(self.obstacles)))
         self.reach = positive_real("AvoidanceCost", "reach", reach)
         self.kind = choice("AvoidanceCost", "kind", kind, ("penalty", "log"))
         heavy = positive_real("AvoidanceCost", "weight", weight)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ...lanes import compiled, traced_as, where_rows
 from ...lanes.gradients import without_gradient
-from ...numerics.checks import fail, flag, integer
+from ...numerics.checks import fail, flag, integer, trailing
 from ..loop.controller import Controller
 from ..policies.sampled_rollout import SampledRollout
 from ..problem.sampled import SampledProblem
@@ -123,6 +123,7 @@ class RecedingHorizon(Controller):
     @without_gradient("RecedingHorizon.init", "x0")
     def init(self, x0: Tensor) -> Following:
         """The first plan, from the states x0 (B, n)."""
+        x0 = trailing(type(self).__name__, "x0", x0, 2).to(self.problem.goal.dtype)
         if self._search is None and self.memory is not None:
             return _following(best_from(self.memory, self._first, x0))
         if self.held:
@@ -139,10 +140,10 @@ class RecedingHorizon(Controller):
     @without_gradient("RecedingHorizon.step", "x")
     def step(self, x: Tensor, carried: Following, uniform: Tensor, dt: float) -> tuple[Tensor, Following]:
         """The first control of the improved plan (B, m), and the plan a step further on."""
-        if self._search is None:
-            return self._followed(x, carried)
-        u, after = self._improved(x, carried)
-        return u, after
+        step = self._followed if self._search is None else self._improved
+        at = trailing("RecedingHorizon.step", "x", x, 2, self.problem.dim)
+        u, after = step(at.to(self.problem.goal.dtype), carried)
+        return u.to(x.dtype), after
 
     def _begun(self, x: Tensor, carried: Following) -> tuple[Tensor, Reference]:
         """Return the start of a search: the memory's plan, or the carried one."""
@@ -284,6 +285,7 @@ class StrainedPlans(Controller):
 
         After `lanes.ready` of the policy, what the loop may need is made and compiled here, too.
         """
+        x0 = trailing("NearOptimal.controller", "x0", x0, 2).to(self.policy.metric.dtype)
         if self.policy.improved.compiled:
             self.policy.meets_bound.hasten()
             self._begun.hasten()
@@ -297,9 +299,12 @@ class StrainedPlans(Controller):
             x, carried, uniform = now
             return self._begun.step(x, self._or_idle(x, carried), uniform, dt)
 
+        given = trailing("NearOptimal.controller", "x", x, 2).dtype
+        x = x.to(self.policy.metric.dtype)
         # The policy sees all rows, as each number of rows would be a program of its own.
         otherwise = self.policy(x), _without(carried)
-        return where_rows(self._strained(x), planned, (x, carried, uniform), otherwise)
+        u, after = where_rows(self._strained(x), planned, (x, carried, uniform), otherwise)
+        return u.to(given), after
 
     def _or_idle(self, x: Tensor, carried: Following) -> Following:
         """The plans, and where a row has none the linear feedback of the goal as one."""

@@ -38,6 +38,10 @@ class Trajectories(NamedTuple):
         found = f"{int(self.converged.sum())} converged" if self.converged.numel() == rows else ""
         return f"Trajectories({rows} of {steps} steps, cost {span(self.cost)}, {found})"
 
+    def to(self, dtype: torch.dtype) -> Trajectories:
+        """Return them with numbers of a dtype."""
+        return Trajectories(*(part.to(dtype) if part.is_floating_point() else part for part in self))
+
 
 class Reference(NamedTuple):
     """Trajectory and feedback that a control is applied around."""

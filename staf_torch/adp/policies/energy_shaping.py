@@ -7,10 +7,11 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from ...numerics.checks import fail, positive_real
+from ...numerics.checks import fail, positive_real, trailing
 from ...systems import ControlAffineSystem
 from ..loop.controller import LQR
 from ..problem.cost import Cost
+from ..problem.shapes import check_value
 
 
 class EnergyShaping(nn.Module):
@@ -63,11 +64,13 @@ class EnergyShaping(nn.Module):
         self.capture = positive_real("EnergyShaping", "capture", capture)
         self.lqr = LQR(system, cost, period)
         self.period = self.lqr.period
+        check_value("EnergyShaping", "energy", energy, self.lqr.cost)
         if self.lqr.cost.bounds is None:
             raise fail("EnergyShaping", "cost", "or the plant must have bounds of the inputs", None)
 
     def forward(self, x: Tensor) -> Tensor:
         """u: (..., n) -> (..., m)."""
+        trailing("EnergyShaping", "x", x, 1, self.lqr.cost.dim)
         cost = self.lqr.cost
         goal = torch.zeros_like(x) if cost.target is None else cost.target.to(x).expand_as(x)
         slope: Tensor = torch.func.grad(lambda z: self.energy(z).sum())(x)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ...lanes import Program, scan
 from ...lanes.tree import Tree
-from ...numerics.checks import fail, integer, one_or_each, positive, positive_real
+from ...numerics.checks import fail, integer, one_or_each, positive, positive_real, trailing
 from ..loop.controller import Controller
 from ..problem.sampled import SampledProblem
 
@@ -100,11 +100,14 @@ class PathIntegral(Controller):
 
     def init(self, x0: Tensor) -> Tensor:
         """No change of the feedback, (B, T, m)."""
-        return x0.new_zeros(len(x0), self.steps, self.problem.inputs)
+        trailing(type(self).__name__, "x0", x0, 2)
+        return x0.new_zeros(len(x0), self.steps, self.problem.inputs, dtype=self.noise.dtype)
 
     def step(self, x: Tensor, carried: Tensor, uniform: Tensor, dt: float) -> tuple[Tensor, Tensor]:
         """The first control of the improved plan (B, m), and the change a step further on."""
+        given = trailing("PathIntegral.step", "x", x, 2, self.problem.dim).dtype
         count, m = len(x), self.problem.inputs
+        x, uniform = x.to(self.noise.dtype), uniform.to(self.noise.dtype)
         plan = carried.unsqueeze(1)
         numbers = uniform.flatten(1)[:, : self.samples * self.knots * m]
         inside = 1 - max(_OUTSIDE, torch.finfo(x.dtype).eps)
@@ -125,7 +128,7 @@ class PathIntegral(Controller):
         better = self.costs(x, blended.unsqueeze(1))[:, 0] < least[:, 0]
         plan = torch.where(better[:, None, None], blended, chosen)
         ahead = torch.cat((plan[:, 1:], torch.zeros_like(plan[:, :1])), dim=1)
-        return self.problem.steered(x, plan[:, 0]), ahead
+        return self.problem.steered(x, plan[:, 0]).to(given), ahead
 
     def costs(self, x: Tensor, change: Tensor) -> Tensor:
         """Return the costs of changes of the feedback, inf if not finite: (B, n), (B, S, T, m) -> (B, S)."""

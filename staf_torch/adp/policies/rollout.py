@@ -14,13 +14,15 @@ from ...centers import Radius, StateFollowingCenters, ball, cross_polytope, ring
 from ...kernels import ExponentialKernel, GaussianKernel, Kernel
 from ...lanes import compiled, each, repeat
 from ...lanes.call import PlannedCall
-from ...lanes.compiled_methods import Rows
-from ...numerics.checks import fail, integer, positive_real
+from ...lanes.compiled_methods import Rows, check_states
+from ...numerics.checks import fail, integer, positive_real, trailing
+from ...numerics.default_device import beside
 from ...numerics.exponential_step import stalls
 from ...systems import Barrier, ControlAffineSystem
 from ..loop.controller import LQR, Policy, Value
 from ..problem.cost import Cost
 from ..problem.held_plant import runge_kutta_loop
+from ..problem.shapes import check_policy, check_problem, check_value
 
 _NAME = "a rollout policy"
 _KEPT = 64  # forms of one state that are remembered
@@ -72,6 +74,7 @@ class RolloutPolicy(nn.Module):
     with Rosenfeld et al., eq. (5), for the fit.
     """
 
+    @beside
     def __init__(
         self,
         basis: StaFBasis,
@@ -92,7 +95,10 @@ class RolloutPolicy(nn.Module):
             )
         if model.dim != basis.dim:
             raise fail("RolloutPolicy", "basis", f"must have the plant's {model.dim} states", basis.dim)
+        check_problem(model, cost)
         self.basis, self.model, self.cost, self.terminal = basis, model, cost.around(model), terminal
+        check_policy("RolloutPolicy", "base", self.cost, base)
+        check_value("RolloutPolicy", "terminal", terminal, self.cost)
         self.horizon = positive_real("RolloutPolicy", "horizon", horizon)
         self.steps = integer("RolloutPolicy", "steps", _STEPS if steps is None else steps, least=1)
         self.depth = integer("RolloutPolicy", "depth", depth, least=1)
@@ -100,12 +106,13 @@ class RolloutPolicy(nn.Module):
         self.base: Policy = base
         if depth > 1:
             settings = {"horizon": horizon, "steps": steps, "depth": depth - 1}
-            self.base = RolloutPolicy(basis, model, cost, base, terminal, **settings)  # type: ignore[arg-type]
-            self.steps = self.base.steps
+            inner = RolloutPolicy(basis, model, cost, base, terminal, **settings)  # type: ignore[arg-type]
+            self.base, self.steps = inner, inner.steps
         else:
             self._check_steps(chosen=steps is None)
 
     @classmethod
+    @beside
     def of_lqr(
         cls,
         system: ControlAffineSystem,
@@ -187,6 +194,7 @@ class RolloutPolicy(nn.Module):
 
     def control(self, x: Tensor) -> Tensor:
         """`forward` in plain torch: (..., n) -> (..., m)."""
+        trailing("RolloutPolicy", "x", x, 1, self.basis.dim)
         return self.cost.policy(self.model.effectiveness(x), self.gradient(x))
 
     def gradient(self, x: Tensor) -> Tensor:
@@ -201,6 +209,7 @@ class RolloutPolicy(nn.Module):
 
     def rollout(self, x: Tensor) -> Tensor:
         """Cost of the base policy over the horizon, and the terminal value: (..., n) -> (...)."""
+        trailing("RolloutPolicy.rollout", "x", x, 1, self.basis.dim)
         length = self.horizon / self.steps
 
         def field(x: Tensor) -> tuple[Tensor, Tensor]:
@@ -252,6 +261,7 @@ class _TwoPrograms:
                 return improve((x, roll((x, u))[0]))[0]
             at = x.reshape(1, -1)  # of another dtype than the program's: what is copied needs its shape
             return improve((at, roll((at.expand(len(u), -1), u))[0].view(1, len(u))))[0]
+        check_states((x,))
         rows = x if x.dim() == 2 else x.unsqueeze(0)
         (batch, dim), u = rows.shape, self._directions.to(x)
         count = len(u)

@@ -9,18 +9,21 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ...approximation.basis import StaFBasis
 from ...lanes import compiled, each, repeat, scan
 from ...lanes.gradients import refuse_gradient
 from ...numerics.box import LARGEST, box_minimum
-from ...numerics.checks import fail, integer, positive_real
+from ...numerics.checks import fail, integer, positive_real, trailing
+from ...numerics.default_device import beside
+from ...numerics.kept_precision import KeptPrecision
 from ...systems import Bounds, Plant, StepPlant
 from ...systems.black_box import Numbers
 from ..loop.controller import LQR, Policy, Value
 from ..problem.cost import Cost, QuadraticCost, matvec
 from ..problem.held_plant import Holding
+from ..problem.shapes import check_policy, check_problem, check_value
 from .rollout import fitted_slope
 
 _SHARES = (1.0, 0.3)  # of the Newton step, that are tried
@@ -49,7 +52,7 @@ class Along(NamedTuple):
     middle: int | None  # the center at z = 0
 
 
-class SampledRollout(nn.Module):
+class SampledRollout(KeptPrecision):
     """u(x) = the best of u_b and u_b + s d, s in {1, 0.3}, by what a simulation of each costs:
 
         Q(x, u) = cost of holding u for one period + sum of the base's costs over the horizon + V_T,
@@ -63,6 +66,9 @@ class SampledRollout(nn.Module):
     NumPy will do. V^ may live along the inputs alone: with a basis of m coordinates z the centers are the
     states x + sum_j z_j B_j / |B_j|, with B_j the columns of B, since B'grad V^ is all of grad V^ that d
     takes. These are 2 m + 1 simulations in place of 2 n + 1.
+
+    Differences of costs decide, which float32 does not hold: states of float32 are computed with in float64,
+    the controls are float32, and `.float()` rounds none of its numbers.
 
     Args:
         basis: kernel and centers, of the n states or of the m inputs; of the latter it is read once, here.
@@ -83,6 +89,7 @@ class SampledRollout(nn.Module):
     rollout that keeps the base's control among its choices does not cost more than the base.
     """
 
+    @beside
     def __init__(
         self,
         basis: StaFBasis,
@@ -103,6 +110,9 @@ class SampledRollout(nn.Module):
             raise fail("SampledRollout", "basis", rule, basis.dim)
         if cost.inputs > LARGEST:
             raise fail("SampledRollout", "plant", f"must have at most {LARGEST} inputs", cost.inputs)
+        check_problem(plant, cost)
+        check_policy("SampledRollout", "base", cost, base)
+        check_value("SampledRollout", "terminal", terminal, cost)
         self.basis, self.plant, self.cost, self.base, self.terminal = basis, plant, cost, base, terminal
         self.period = positive_real("SampledRollout", "period", period)
         self.steps = integer("SampledRollout", "steps", steps, least=4)
@@ -127,6 +137,9 @@ class SampledRollout(nn.Module):
 
     def control(self, x: Tensor) -> Tensor:
         """`forward` in plain torch: (..., n) -> (..., m)."""
+        trailing(type(self).__name__, "x", x, 1, self.cost.dim)
+        if x.dtype != self.metric.dtype:
+            return self.control(x.to(self.metric.dtype)).to(x.dtype)
         base = self.bounds.clip(self.base(x))
         step, known = self._proposed(x, base)
         tried = torch.stack([base, *(self.bounds.clip(base + share * step) for share in _SHARES)], dim=-2)
@@ -213,6 +226,9 @@ class SampledRollout(nn.Module):
     @compiled("whether a bound is met")
     def meets_bound(self, x: Tensor) -> Tensor:
         """1 where the base, followed over the horizon, meets a bound, else 0: (..., n) -> (..., 1)."""
+        if x.dtype != self.metric.dtype:
+            exact: Tensor = self.meets_bound.definition(x.to(self.metric.dtype))
+            return exact.to(x.dtype)
         low, high = self.bounds.low.to(x), self.bounds.high.to(x)
 
         def step(now: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
@@ -241,6 +257,9 @@ class SampledRollout(nn.Module):
 
     def value(self, x: Tensor) -> Tensor:
         """Return the cost that the chosen control promises: (..., n) -> (...)."""
+        trailing(f"{type(self).__name__}.value", "x", x, 1, self.cost.dim)
+        if x.dtype != self.metric.dtype:
+            return self.value(x.to(self.metric.dtype)).to(x.dtype)
         after, paid = self.holding(x, self.control(x))
         return paid + self._discount() * self.rollout(after).whole
 

@@ -20,9 +20,12 @@ from ...numerics.checks import (
     positive,
     positive_real,
     real,
+    trailing,
     vector,
 )
+from ...numerics.default_device import beside
 from ...numerics.linalg import positive_definite, positive_semidefinite
+from ...numerics.row_checks import check_rows
 from ...numerics.shown import limits, shown, sizes
 from ...systems import Bounds, Plant
 from ...systems.bounds import Limit
@@ -68,6 +71,7 @@ class Cost(nn.Module, abc.ABC):
             argument breaks its rule.
     """
 
+    @beside
     def __init__(
         self,
         state: Matrix,
@@ -87,7 +91,8 @@ class Cost(nn.Module, abc.ABC):
         name = type(self).__name__
         self.dim, self.inputs, self.output = dim, inputs, output
         self.target = _point(name, "target", target, dim)
-        seen = dim if output is None else _outputs(name, output, dim)
+        tried = torch.zeros(dim, dtype=torch.float64) if self.target is None else self.target
+        seen = dim if output is None else _outputs(name, output, tried, inputs)
         q = positive_semidefinite(name, "state", square(name, "state", state, seen), seen)
         self.register_buffer("q", q)
         r = positive_definite(name, "control", square(name, "control", control, inputs), inputs)
@@ -102,6 +107,8 @@ class Cost(nn.Module, abc.ABC):
         if terminal is not None and (self.discount or (output is not None and not callable(terminal))):
             raise fail(name, "terminal", "must be None beside an output or a discount", terminal)
         self.end_value = terminal if callable(terminal) else None
+        if self.end_value is not None:
+            check_rows(f"{name}(terminal=...)", self.end_value, [tried], sizes=(inputs,))
         end = None if terminal is None or callable(terminal) else square(name, "terminal", terminal, dim)
         self.register_buffer(
             "end", None if end is None else positive_semidefinite(name, "terminal", end, dim)
@@ -113,6 +120,7 @@ class Cost(nn.Module, abc.ABC):
         self.bounds: Bounds | None = bounds if bounds.present else None
         self._prepare()
 
+    @beside
     def around(self, plant: Plant) -> Self:
         """This cost with a plant's equilibrium, periodic coordinates and bounds where it states none of its
         own; itself where there is nothing to add.
@@ -190,6 +198,7 @@ class Cost(nn.Module, abc.ABC):
 
     def state_rate(self, x: Tensor) -> Tensor:
         """e'Qe: (..., n) -> (...)."""
+        trailing(type(self).__name__, "x", x, 1, self.dim)
         return quadratic(self.q, self.error(self.outputs(x)))
 
     def outputs(self, x: Tensor) -> Tensor:
@@ -228,6 +237,7 @@ class Cost(nn.Module, abc.ABC):
 
     def rate(self, x: Tensor, u: Tensor) -> Tensor:
         """e'Qe + U(u): (..., n), (..., m) -> (...)."""
+        trailing(type(self).__name__, "u", u, 1, self.inputs)
         return self.state_rate(x) + self.input_rate(u)
 
     @abc.abstractmethod
@@ -447,10 +457,9 @@ def _point(call: str, name: str, value: Sequence[float] | Tensor | None, size: i
     return torch.tensor(vector(call, name, given, size), dtype=torch.float64, device="cpu")
 
 
-def _outputs(call: str, output: Output, dim: int) -> int:
-    """p: the size of the output at a batch of one state."""
-    seen = output(torch.zeros(1, dim, dtype=torch.float64, device="cpu"))
-    if not isinstance(seen, Tensor) or seen.dim() != 2 or len(seen) != 1:
-        shape = tuple(seen.shape) if isinstance(seen, Tensor) else seen
-        raise fail(call, "output", f"must map (..., {dim}) to (..., p)", shape)
-    return seen.shape[-1]
+def _outputs(call: str, output: Output, x: Tensor, inputs: int) -> int:
+    """p: the size of the output, the same for any number of rows."""
+    seen = output(x.unsqueeze(0))
+    count = seen.shape[-1] if isinstance(seen, Tensor) and seen.dim() == 2 else 1
+    check_rows(f"{call}(output=...)", output, [x], (count,), sizes=(inputs,))
+    return count

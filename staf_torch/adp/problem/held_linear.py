@@ -16,6 +16,7 @@ from ...numerics.checks import fail, positive_real
 from ...numerics.differences import STEP, central_slopes
 from ...numerics.exponential_step import quadratic_integral
 from ...numerics.linalg import check_modes, discrete_riccati, exponential, unstabilisable_mode
+from ...numerics.row_checks import check_rows, is_ours
 from ...signs import Sign
 from ...systems import Clocked, Plant
 from .cost import Cost
@@ -206,6 +207,9 @@ class HeldLoop(NamedTuple):
             clocked = system
             return cls.of(lambda x: policy(clocked.at(x)), system.plant, at=at)
         at = system.equilibrium() if at is None else at
+        if not is_ours(policy):
+            known = (system.inputs or 1,)
+            check_rows("held_stability(policy=...)", lambda x: policy(x).expand(len(x), -1), [at], known)
         with torch.no_grad():
             slope = central_slopes(
                 lambda x: policy(x).double().expand(len(x), -1),

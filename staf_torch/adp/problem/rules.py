@@ -18,6 +18,7 @@ from ...systems import Bounds, Clocked, Plant
 from ...systems.equilibria import check_rest
 from .cost import Cost
 from .held_linear import HeldLoop
+from .shapes import check_problem
 
 _log = logging.getLogger(__name__)
 _NEAR, _NOTHING = 1e-4, 1e-9  # of a state around the set-point, and of the cost rate there
@@ -115,6 +116,7 @@ def regulated(call: str, plant: Plant, cost: Cost, argument: str = "cost") -> Co
         ValueError: if the sizes differ, the plant does not rest at the set-point, or its input is not within
             the bounds.
     """
+    check_problem(plant, cost)
     placed = cost.around(plant)
     _check_held(call, plant, placed, argument)
     return placed
@@ -213,7 +215,11 @@ def warn_if_unstable(policy: Callable[[Tensor], Tensor], plant: Plant, cost: Cos
     Returns:
         The fastest mode of the linearised plant without control, 1/s; inf where it is not known.
     """
-    held = HeldLoop.of(policy, plant, at=cost.set_point())
+    try:
+        held = HeldLoop.of(policy, plant, at=cost.set_point())
+    except (RuntimeError, ValueError) as error:  # a loop runs where nobody can say whether it is stable
+        _log.info("whether the linearised loop is stable was not looked at: %s", error)
+        return math.inf
     radius = held.spectral_radius(dt)
     fastest = float(torch.linalg.eigvals(held.f).abs().max()) if held.finite else math.inf
     if not radius >= 1:

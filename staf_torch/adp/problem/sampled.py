@@ -16,8 +16,10 @@ from ...lanes import each, traced_as
 from ...lanes.gradients import without_gradient
 from ...numerics.angles import turned, unwrapped, wrap
 from ...numerics.checks import fail, integer, trailing
+from ...numerics.default_device import beside
 from ...numerics.forward_mode import use_forward_mode
 from ...numerics.linalg import discrete_riccati, positive_semidefinite, unstabilisable_mode
+from ...numerics.row_checks import check_rows, is_ours
 from ...numerics.runge_kutta import runge_kutta_mean, runge_kutta_stages
 from ...numerics.shown import limits, sizes
 from ...systems import Bounds, Plant
@@ -25,6 +27,7 @@ from ...systems.bounds import Limit
 from .cost import Cost, EndValue, Matrix, square
 from .held_plant import Holding
 from .rules import check_torch, check_undiscounted, check_within, own_period
+from .shapes import check_problem
 from .tracking_cost import Path, TrackingCost
 
 StepFunction = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
@@ -75,6 +78,7 @@ class SampledProblem(nn.Module):
     """
 
     @without_gradient("SampledProblem", "step", "goal", "rest", "terminal")
+    @beside
     def __init__(
         self,
         step: StepFunction,
@@ -139,6 +143,7 @@ class SampledProblem(nn.Module):
 
     @classmethod
     @without_gradient("SampledProblem.of", "plant", "cost", "terminal")
+    @beside
     def of(
         cls,
         plant: Plant,
@@ -169,6 +174,7 @@ class SampledProblem(nn.Module):
             ValueError: if an argument breaks its rule, or as in `SampledProblem`.
         """
         check_torch("SampledProblem.of", "plant", plant)
+        check_problem(plant, cost)
         cost = cost.bounded(low, high).around(plant)
         check_undiscounted("SampledProblem.of", cost)
         h = own_period("SampledProblem.of", plant, dt)
@@ -283,10 +289,7 @@ class SampledProblem(nn.Module):
         if terminal is None:
             return self.p.clone()
         if callable(terminal):
-            value = terminal(self.goal.expand(2, -1))
-            if not isinstance(value, Tensor) or value.shape != (2,):
-                got = tuple(value.shape) if isinstance(value, Tensor) else value
-                raise fail("SampledProblem", "terminal", f"must map x (2, {self.dim}) to values (2,)", got)
+            check_rows("SampledProblem(terminal=...)", terminal, [self.goal], sizes=(self.inputs,))
             return torch.zeros_like(self.p)
         return positive_semidefinite(
             "SampledProblem", "terminal", square("SampledProblem", "terminal", terminal, self.dim), self.dim
@@ -297,13 +300,12 @@ class SampledProblem(nn.Module):
         """Check the shapes, and return how far the goal moves in a step, and at what cost."""
         x, u = self.goal.expand(2, -1), self.rest.expand(2, -1)
         trailing("SampledProblem", "goal", self.goal, 1, self.dim)
+        if not is_ours(self.step):
+            known, given = (self.dim, self.inputs), [self.goal, self.rest]
+            for k, (part, inner) in enumerate((("x+", (self.dim,)), ("costs", ()))):
+                what = f"SampledProblem(step=...)`, its {part}, `step(x, u)[{k}]"
+                check_rows(what, lambda *z, k=k: self.step(*z)[k], given, inner, sizes=known)
         after, paid = self.step(x, u)
-        if after.shape != x.shape or paid.shape != x.shape[:1]:
-            raise ValueError(
-                f"`SampledProblem(step=...)` must map x {tuple(x.shape)} and u {tuple(u.shape)} to x+ "
-                f"{tuple(x.shape)} and costs {tuple(x.shape[:1])}; got {tuple(after.shape)} and "
-                f"{tuple(paid.shape)}."
-            )
         if self.path is not None:
             self.tick = float(after[0, -1] - x[0, -1])
             if not self.tick > 0:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ...numerics.angles import wrap
 from ...numerics.checks import copied, fail
+from ...numerics.row_checks import check_rows
 from ...systems import Clocked, Plant
 from ...systems.bounds import Limit
 from .cost import Cost, Matrix, QuadraticCost
@@ -65,10 +66,8 @@ class TrackingCost(QuadraticCost):
         q = torch.nn.functional.pad(still.q, (0, 1, 0, 1))
         super().__init__(q, still.r, dim + 1, inputs, low=low, high=high, target_input=target_input)
         self.still, self.path = still, path
-        seen = path(torch.zeros(2, dtype=torch.float64, device="cpu"))
-        if not isinstance(seen, Tensor) or seen.shape != (2, dim):
-            shape = tuple(seen.shape) if isinstance(seen, Tensor) else seen
-            raise fail("TrackingCost", "path", f"must map times (2,) to states (2, {dim})", shape)
+        now = torch.zeros((), dtype=torch.float64, device="cpu")
+        check_rows("TrackingCost(path=...)", path, [now], (dim,), sizes=(inputs,))
 
     def around(self, plant: Plant) -> Self:
         """This cost with the plant's bounds, periodic coordinates and resting input where it has none.

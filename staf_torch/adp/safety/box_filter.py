@@ -101,6 +101,7 @@ class BoxFilter(nn.Module):
 
     def forward(self, s: Tensor) -> Tensor:
         """u: (..., n) -> (..., m)."""
+        trailing("BoxFilter", "s", s, 1, self.box.dim)
         return self.held(s, self.hold(s))
 
     def held(self, s: Tensor, hold: Tensor) -> Tensor:

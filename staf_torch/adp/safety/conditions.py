@@ -15,7 +15,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ...numerics.checks import fail, non_negative, one_or_each, positive
+from ...numerics.checks import fail, non_negative, one_or_each, positive, trailing
+from ...numerics.row_checks import check_rows
 from ...numerics.runge_kutta import runge_kutta_step
 from ...systems import Bounds, Plant, StepPlant
 from ..problem.held_plant import Holding
@@ -98,7 +99,6 @@ class Conditions(nn.Module):
         self.low: Tensor  # (m,) as far as brakes may reach
         self.high: Tensor
         x, t = self._around()
-        self._check_shapes(x)
         values = self.margins(x, t).unflatten(0, (len(TIMES), _PROBES))
         self.moving = bool((values != values[:1]).any())
         self.degree = self._degrees(degree, x, t)
@@ -116,8 +116,11 @@ class Conditions(nn.Module):
 
     def margins(self, x: Tensor, t: float | Tensor = 0.0) -> Tensor:
         """h of every constraint: (..., n) and a number or (...) -> (..., k)."""
+        trailing("SafetyFilter.margins", "x", x, 1, self.plant.dim)
         time = torch.as_tensor(t, device=x.device).to(x).expand(x.shape[:-1]).reshape(-1)
         rows = x.reshape(-1, x.shape[-1])
+        if not len(rows):
+            return x.new_zeros(*x.shape[:-1], len(self.constraints))
         columns = [torch.func.vmap(h)(rows.unsqueeze(1), time) for h in map(number, self.constraints)]
         return torch.stack(columns, dim=-1).reshape(*x.shape[:-1], -1)
 
@@ -262,12 +265,6 @@ class Conditions(nn.Module):
         x = (self.plant.equilibrium() + around).repeat(len(TIMES), 1)
         return x, torch.tensor(TIMES, dtype=torch.float64, device="cpu").repeat_interleave(_PROBES)
 
-    def _check_shapes(self, x: Tensor) -> None:
-        for k, h in enumerate(self.constraints):
-            shape = tuple(h(x[:3], torch.zeros((), dtype=x.dtype, device=x.device)).shape)
-            if shape != (3,):
-                raise fail("SafetyFilter", "constraints", f"must map (3, n) to (3,), number {k}", shape)
-
     def _degrees(self, degree: int | Sequence[int] | None, x: Tensor, t: Tensor) -> tuple[int, ...]:
         if degree is not None:
             given = [degree] * len(self.constraints) if isinstance(degree, int) else list(degree)
@@ -395,11 +392,15 @@ def _speed(rate: Tensor) -> Tensor:
     return torch.where(rate < 0, -rate, 0.0)
 
 
-def listed(call: str, constraints: Constraint | Sequence[Constraint]) -> list[Constraint]:
-    """The constraints as a list, refused in the name of ``call`` where they are no functions."""
+def listed(call: str, constraints: Constraint | Sequence[Constraint], plant: Plant) -> list[Constraint]:
+    """The constraints as a list, refused in the name of ``call`` where they are no functions of rows."""
     several = [constraints] if callable(constraints) else list(constraints)
     if not several or not all(map(callable, several)):
         raise fail(call, "constraints", "must be h(x, t) or a list of them", constraints)
+    x, t = plant.equilibrium(), torch.zeros((), dtype=torch.float64)
+    sizes = (len(several), plant.inputs, _PROBES, len(TIMES), _PROBES * len(TIMES))
+    for k, h in enumerate(several):
+        check_rows(f"{call}(constraints=...)` number {k} `h(x, t)", h, [x], shared=[t], sizes=sizes)
     return several
 
 

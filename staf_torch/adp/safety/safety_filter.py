@@ -13,11 +13,13 @@ from torch import Tensor
 from ...lanes import compiled, repeat, where_rows
 from ...lanes.gradients import gradients_of, marked
 from ...numerics.checks import fail, one_or_each, positive, positive_real, trailing
+from ...numerics.default_device import beside
 from ...numerics.shown import limits, shown
 from ...systems import Bounds, Plant
 from ...systems.bounds import Limit
 from ..loop.controller import Carried, Controller, Feedback, Policy
 from ..loop.simulation import LoopResult
+from ..problem.shapes import check_plant
 from .conditions import Conditions, Constraint, Lean, check_traceable, listed
 from .look_ahead import LookAhead
 from .quadratic_program import cases, nearest_admissible
@@ -127,6 +129,7 @@ class SafetyFilter(Controller):
     (2020), for what a backup law keeps.
     """
 
+    @beside
     def __init__(
         self,
         policy: Policy | Controller,
@@ -143,6 +146,7 @@ class SafetyFilter(Controller):
     ) -> None:
         super().__init__()
         check_traceable("SafetyFilter", plant)
+        check_plant(plant)
         own = Bounds(low, high, plant.inputs)
         self.bounds = plant.bounds if not own.present and plant.bounds is not None else own
         given = {"plant": plant, "constraints": constraints} if self.bounds.present else {}
@@ -165,7 +169,7 @@ class SafetyFilter(Controller):
         self.plant, self.draws = plant, self.controller.draws
         self.hold = positive_real("SafetyFilter", "dt", dt)
         self.period = self.hold
-        self.constraints = listed("SafetyFilter", constraints)
+        self.constraints = listed("SafetyFilter", constraints, plant)
         count = len(self.constraints)
         self.conditions = Conditions(plant, self.constraints, self.bounds, self.hold, decay, degree, margin)
         self.degree, self.moving = self.conditions.degree, self.conditions.moving
@@ -216,8 +220,14 @@ class SafetyFilter(Controller):
         """
         if not isinstance(self.controller, Feedback):
             raise fail("SafetyFilter", "policy", "must be a function of x to be asked at x", self.controller)
-        return self.restrain(x, self.controller.policy(x), t).control
+        try:
+            u = self.controller.policy(x)
+        except Exception:
+            trailing("SafetyFilter", "x", x, 1, self.plant.dim)
+            raise
+        return self.restrain(x, u, t).control
 
+    @beside
     def restrain(self, x: Tensor, u: Tensor, t: float | Tensor | None = None) -> Filtered:
         """Return the control to apply in place of u: (..., n), (..., m).
 
@@ -229,19 +239,26 @@ class SafetyFilter(Controller):
         Raises:
             ValueError: if a constraint depends on the time, which is missing, or a shape is wrong.
         """
-        trailing("SafetyFilter", "x", x, 1, self.plant.dim)
-        trailing("SafetyFilter", "u", u, 1, self.plant.inputs)
+        plant = self.plant
+        trailing("SafetyFilter", "x", x, 1, plant.dim, meta=False)
+        trailing("SafetyFilter", "u", u, 1, plant.inputs, meta=False)
         if t is None and self.moving:
             raise fail("SafetyFilter", "t", "must be given: a constraint depends on the time", t)
         time = torch.as_tensor(0.0 if t is None else t, device=x.device).to(x).expand(x.shape[:-1])
         if self.ahead.by_policy:
             self._nearest.hasten()  # hundreds of periods are followed: seconds in plain torch
-        found, k = self._nearest(torch.cat((x, u, time.unsqueeze(-1)), dim=-1)), len(self.constraints)
+        try:
+            z = torch.cat((x, u, time.unsqueeze(-1)), dim=-1)
+        except RuntimeError as error:
+            rule = f"must be of the rows of x, {tuple(x.shape[:-1])}"
+            raise fail("SafetyFilter", "u", rule, tuple(u.shape[:-1])) from error
+        found, k = self._nearest(z), len(self.constraints)
         control, margin, more = found.split((m := u.shape[-1], k, found.shape[-1] - m - k), dim=-1)
         astray = more[..., 1] if self.ahead.opposed else torch.zeros_like(time)
         return marked("SafetyFilter", self.layers, Filtered(control, margin, more[..., 0], astray))
 
     def init(self, x0: Tensor) -> Watched:
+        trailing(type(self).__name__, "x0", x0, 2)
         none = x0.new_zeros(len(x0))
         return Watched(self.controller.init(x0), none, none + math.inf, *(none.clone() for _ in range(3)))
 
@@ -297,7 +314,12 @@ class SafetyFilter(Controller):
     @compiled("a safety filter")
     def _nearest(self, z: Tensor) -> Tensor:
         """u, margins, slack and astray of rows of (x, u, t): (..., n + m + 1) -> (..., m + k + 2)."""
+        if z.dtype != self.unit.dtype:  # what is missing is a difference that float32 does not hold
+            exact: Tensor = self._nearest.definition(z.to(self.unit.dtype))
+            return exact.to(z.dtype)
         n, m = self.plant.equilibrium().numel(), self.plant.inputs
+        if not z.numel():
+            return z.new_zeros(*z.shape[:-1], m + len(self.constraints) + 1 + self.ahead.opposed)
         flat = z.reshape(-1, z.shape[-1])
         x, wanted, t = flat[:, :n], flat[:, n : n + m], flat[:, n + m]
         low, high = self.bounds.low.to(x), self.bounds.high.to(x)

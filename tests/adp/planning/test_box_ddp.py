@@ -188,7 +188,10 @@ def numpy_plant() -> systems.StepPlant:
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: adp.SampledProblem(lambda x, u: (x, u), dim=2, inputs=1), "must map x .2, 2. and u"),
+        (
+            lambda: adp.SampledProblem(lambda x, u: (x, u), dim=2, inputs=1),
+            r"`step\(x, u\)\[1\]` must map rows .5, 2., .5, 1. to .5,.",
+        ),
         (lambda: adp.BoxDDP(BOUNDED, steps=0), "must be at least 1"),
         (lambda: adp.BoxDDP(BOUNDED, steps=5).solve(X0, still(2, 6)), r"must have the shape \(2, 5, 1\)"),
         (

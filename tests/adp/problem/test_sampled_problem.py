@@ -125,11 +125,14 @@ def test_a_problem_without_a_regulator_says_why_and_ends_at_no_cost(
 
 
 def test_a_step_of_either_wrong_shape_is_refused() -> None:
-    for step, shown in (
-        (lambda x, u: (x[:, :1], x.sum(-1)), r"\(2, 1\) and \(2,\)"),
-        (lambda x, u: (x, u**2), r"\(2, 2\) and \(2, 1\)"),
+    for step, said in (
+        (
+            lambda x, u: (x[:, :1], x.sum(-1)),
+            r"x\+, .*\[0\]` must map rows \(5, 2\), \(5, 1\) .*; got \(5, 1\)",
+        ),
+        (lambda x, u: (x, u**2), r"costs, .*\[1\]` must .* to \(5,\), .*; got \(5, 1\)"),
+        (lambda x, u: (x, 0.0), r"costs, .* to \(5,\), .*, as a tensor; got 0.0"),
     ):
-        said = rf"must map x \(2, 2\) and u \(2, 1\) to x\+ \(2, 2\) and costs \(2,\); got {shown}"
         with pytest.raises(ValueError, match=said):
             adp.SampledProblem(step, dim=2, inputs=1)
 

@@ -151,7 +151,10 @@ def test_loop_that_is_held_too_long_is_said_to_be_unstable(caplog: pytest.LogCap
     ("function", "message"),
     [
         (lambda x, u: x, r"`StepPlant\(step=...\)` ignores u"),
-        (lambda x, u: x[:, 0] + u[:, 0], r"must map x and u of the shapes \(6, 2\) and \(6, 1\) to \(6, 2\)"),
+        (
+            lambda x, u: x[:, 0] + u[:, 0],
+            r"must map x and u of the shapes \(10, 2\) and \(10, 1\) to \(10, 2\)",
+        ),
         (lambda x, u: 1 / 0, r"`StepPlant\(step=...\)` raised ZeroDivisionError \(division by zero\)"),
         (lambda x, u: np.nan * (x + u), r"returned values that are not finite near x"),
         (3.0, r"must be a function of x \(B, n\) and u \(B, m\); got 3.0"),

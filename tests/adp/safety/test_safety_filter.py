@@ -174,7 +174,10 @@ def test_a_copy_a_pickle_and_single_precision_are_the_same_filter() -> None:
             "must be in continuous time",
         ),
         ({"constraints": []}, r"must be h\(x, t\) or a list of them"),
-        ({"constraints": lambda x, t: x}, r"must map \(3, n\) to \(3,\), number 0; got \(3, 2\)"),
+        (
+            {"constraints": lambda x, t: x},
+            r"number 0 `h\(x, t\)` must map rows \(7, 2\) to \(7,\), .*; got \(7, 2\)",
+        ),
         (
             {"constraints": lambda x, t: 1 + 0 * x[:, 0]},
             "moves neither first nor second derivative of number 0",

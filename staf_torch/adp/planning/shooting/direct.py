@@ -12,6 +12,7 @@ from torch import Tensor
 from ....lanes.gradients import without_gradient
 from ....lanes.opaque import opaque
 from ....numerics.checks import fail, integer, positive_real, trailing
+from ....numerics.default_device import beside
 from ....numerics.linalg import positive_semidefinite
 from ....signs import Sign
 from ....systems import ControlAffineSystem, Linear, Plant
@@ -26,6 +27,7 @@ from ...problem.rules import (
     restless,
     set_point,
 )
+from ...problem.shapes import check_policy, check_problem, check_value
 from ..trajectories import Trajectories, chosen
 from .merging import ROWS, cheapest, joined, merged, selected
 from .mesh import graded, halved, split
@@ -113,6 +115,7 @@ class DirectShooting:
     """
 
     @without_gradient("DirectShooting", "system", "cost", "base", "terminal")
+    @beside
     def __init__(
         self,
         system: Plant,
@@ -135,6 +138,7 @@ class DirectShooting:
         if cost.ending is not None and horizon is None:
             raise fail("DirectShooting", "horizon", "must be given beside a terminal cost", None)
         check_undiscounted("DirectShooting", cost)
+        check_problem(system, cost)
         self.stage = Interval(system, cost)
         rates = (1.0, 0.0)
         self.lqr: LQR | None = None
@@ -144,6 +148,7 @@ class DirectShooting:
         given = () if base is None else tuple(base) if isinstance(base, Sequence) else (base,)
         if not given or (len(given) > 1 and self.lqr is not None):
             given = (*given, self._resting if self.lqr is None else self.lqr)
+        check_policy("DirectShooting", "base", cost, *given)
         self.bases, self.alone = given, base is None and self.lqr is None
         self.terminal = self._end(terminal)
         x = set_point(system, cost)[0]
@@ -207,7 +212,7 @@ class DirectShooting:
                 return cost.terminal
             return (lambda x: torch.zeros_like(x[..., 0])) if self.lqr is None else self.lqr.value
         if callable(terminal):
-            return terminal
+            return check_value("DirectShooting", "terminal", terminal, cost)
         end = square("DirectShooting", "terminal", terminal, cost.dim)
         end = positive_semidefinite("DirectShooting", "terminal", end, cost.dim)
         return lambda x: quadratic(end, cost.deviation(x))
@@ -219,6 +224,7 @@ class DirectShooting:
     @opaque
     @without_gradient("DirectShooting.solve", "x0", "self")
     @Sign("DirectShooting")
+    @beside
     def solve(self, x0: Tensor, *, warm: Optimum | None = None) -> Optimum:
         """The optima from x0, (B, n).
 
@@ -229,7 +235,7 @@ class DirectShooting:
         Raises:
             ValueError: if x0 is no batch of states of the plant.
         """
-        trailing("DirectShooting.solve", "x0", x0, dims=2, last=self.stage.system.dim)
+        trailing("DirectShooting.solve", "x0", x0, dims=2, last=self.stage.system.dim, meta=False, vmap=False)
         parts = list[Optimum]()
         with Sign("", len(x0), "states") as sign:
             for k, rows in enumerate(x0.split(ROWS)):

@@ -1,0 +1,70 @@
+"""Shapes of what a user's plant, cost, policy and values return, checked where they are given."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from ...numerics.row_checks import check_rows, is_ours
+from ...systems import ControlAffineSystem, Plant
+from ...systems.user_plants import FunctionPlant
+from .cost import Cost
+
+Function = Callable[[Tensor], Tensor]
+
+
+def check_problem(plant: Plant, cost: Cost) -> None:
+    """Refuse a plant or a cost whose rates are not those of rows, whatever their number."""
+    check_plant(plant)
+    check_cost(cost)
+
+
+def check_plant(plant: Plant) -> None:
+    """Refuse a plant whose rates are not those of rows, whatever their number.
+
+    Raises:
+        ValueError: that names the method and what it returned.
+    """
+    if plant.dim is None or isinstance(plant, FunctionPlant) or is_ours(type(plant)):
+        return  # a function was tried when its plant was made
+    name, x, u = type(plant).__name__, plant.equilibrium(), plant.resting_input()
+    if isinstance(plant, ControlAffineSystem):
+        check_rows(f"{name}.drift", plant.drift, [x], (len(x),), sizes=(len(u),))
+        check_rows(f"{name}.effectiveness", plant.effectiveness, [x], (len(x), len(u)))
+    else:
+        check_rows(f"{name}.motion", plant.motion, [x, u], (len(x),))
+
+
+def check_cost(cost: Cost) -> None:
+    """Refuse a cost of a user whose rates are not numbers, one a row.
+
+    Raises:
+        ValueError: that names the method and what it returned.
+    """
+    if is_ours(type(cost)):
+        return
+    name, x, u = type(cost).__name__, state_of(cost), torch.zeros(cost.inputs, dtype=torch.float64)
+    check_rows(f"{name}.state_rate", cost.state_rate, [x], sizes=(len(u),))
+    check_rows(f"{name}.input_rate", cost.input_rate, [u], sizes=(len(x),))
+    check_rows(f"{name}.rate", cost.rate, [x, u])
+
+
+def check_value(call: str, name: str, value: Function, cost: Cost) -> Function:
+    """Return a function of the state, refused where it is not one number a row: V, V_T, an energy."""
+    if not is_ours(value):
+        check_rows(f"{call}({name}=...)", value, [state_of(cost)], sizes=(cost.inputs,))
+    return value
+
+
+def check_policy(call: str, name: str, cost: Cost, *policies: Function) -> None:
+    """Refuse policies that are not one control a row."""
+    for policy in policies:
+        if not is_ours(policy):
+            check_rows(f"{call}({name}=...)", policy, [state_of(cost)], (cost.inputs,))
+
+
+def state_of(cost: Cost) -> Tensor:
+    """A state to try functions at, (n,): the set-point, or the origin."""
+    return torch.zeros(cost.dim, dtype=torch.float64) if cost.target is None else cost.target

@@ -1,0 +1,284 @@
+"""What is given to a door, and what a user's function returns there: right, or one sentence by name."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+import staf_torch as st
+from staf_torch import adp, lanes, online, optim, systems, targets
+
+X = torch.tensor([[0.25, 0.125], [-0.25, 0.5], [1.0, -1.0]], dtype=torch.float64)  # exact in float32
+PLANT = systems.Pendulum()
+CART = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
+COST = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+LQR = adp.LQR(PLANT, COST)
+BASIS = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(st.rings(6), 0.1))
+ROLLOUT = adp.RolloutPolicy.of_lqr(PLANT, COST, steps=4, horizon=0.2)
+NEAR = adp.near_optimal(PLANT, COST, dt=0.05, reach="local")
+WALL = adp.SafetyFilter(LQR, PLANT, lambda x, t: 1.5 - x[:, 0], dt=0.05, low=-9.0, high=9.0)
+PROBLEM = adp.SampledProblem.of(PLANT, COST, dt=0.05)
+PLANS = adp.RecedingHorizon(PROBLEM, steps=6, compile=False)
+LAW = optim.SteepestDescent()
+
+
+def square(x: Tensor) -> Tensor:
+    return x.square().sum(-1)
+
+
+def whole(x: Any) -> Any:
+    """States as those of one time, (B, 1, n)."""
+    return x.unsqueeze(1) if isinstance(x, Tensor) and x.dim() == 2 and x.layout is torch.strided else x
+
+
+DOORS: dict[str, Callable[[Any], Any]] = {
+    "LQR": LQR,
+    "LQR.value": LQR.value,
+    "RolloutPolicy": ROLLOUT,
+    "RolloutPolicy.rollout": ROLLOUT.rollout,
+    "NearOptimal": NEAR,
+    "NearOptimal.value": NEAR.value,
+    "SafetyFilter": lambda x: WALL.restrain(x, X[:, :1]),
+    "SafetyFilter.margins": WALL.margins,
+    "RecedingHorizon": PLANS.init,
+    "simulate": lambda x: adp.simulate(LQR, PLANT, COST, x, dt=0.05, steps=2),
+    "trajectory": lambda x: systems.simulate(PLANT, x, dt=0.05, steps=2),
+    "BoxDDP.solve": lambda x: adp.BoxDDP(PROBLEM, steps=2, compile=False).solve(x),
+    "chase": lambda x: st.chase(whole(x), BASIS, square, LAW),
+    "chase_weights": lambda x: st.chase_weights(whole(x), BASIS, square, LAW),
+    "StaF.fit_": lambda x: st.StaF(BASIS, (3,)).fit_(x, square),
+    "StateFollowingCenters": BASIS.gram,
+    "QuadraticCost": lambda x: COST.rate(x, X[:, :1]),
+    "Pendulum": lambda x: PLANT.rate(x, X[:, :1]),
+    "hjb_residual": lambda x: adp.hjb_residual(PLANT, COST, square, x),
+}
+REFUSED: dict[str, tuple[Any, str]] = {
+    "integers": ((4 * X).long(), r"floating-point tensor and is torch.int64: write `.double\(\)`; got"),
+    "flags": (X > 0, r"is torch.bool: write `.double\(\)`"),
+    "complex": (torch.complex(X, X), r"is torch.complex128: write `.real.double\(\)`"),
+    "an array": (X.numpy(), r"must be a tensor, as by `torch.as_tensor.*an array .* of float64"),
+    "a list": (X.tolist(), "must be a tensor, as by"),
+    "nothing": (None, "must be a tensor, .*got None"),
+    "one number": (torch.tensor(0.5, dtype=torch.float64), r"must have at least \d dimensions?; got the"),
+    "sparse": (X.to_sparse(), r"must be dense; got torch.sparse_coo: write `.to_dense\(\)`"),
+    "other states": (torch.zeros(3, 5, dtype=torch.float64), "must have 2 entries in its last dimension"),
+}
+
+
+@pytest.mark.parametrize("door", list(DOORS))
+def test_what_is_no_state_is_refused_by_argument_and_what_to_write(door: str) -> None:
+    for kind, (given, message) in REFUSED.items():
+        with pytest.raises(ValueError, match=message) as caught:
+            DOORS[door](given)
+        assert str(caught.value).startswith("`"), kind
+        assert "=...)`" in str(caught.value), kind
+
+
+@pytest.mark.compiled
+@pytest.mark.needs_compiler
+def test_a_view_with_a_pending_sign_and_a_spread_row_are_the_numbers_that_they_show() -> None:
+    negative = torch.complex(torch.zeros_like(X), -X).conj().imag
+    assert negative.is_neg()
+    assert lanes.ready(NEAR, X)
+    torch.testing.assert_close(NEAR(negative), NEAR(X), rtol=1e-9, atol=0)
+    assert NEAR(X[:1].expand(3, 2)).equal(NEAR(X[:1].repeat(3, 1)))
+    for given, message in REFUSED.values():
+        with pytest.raises(ValueError, match=message):
+            NEAR(given)
+
+
+POLICIES: dict[str, Callable[[], nn.Module]] = {
+    "LQR": lambda: LQR,
+    "rollout": lambda: ROLLOUT,
+    "near_optimal": lambda: NEAR,
+    "filter": lambda: WALL,
+    "bounded": lambda: adp.near_optimal(PLANT, COST, dt=0.05, low=-2.0, high=2.0, reach="local"),
+}
+
+
+@pytest.mark.parametrize("name", list(POLICIES))
+def test_float32_states_get_the_control_of_float64_in_float32(name: str) -> None:
+    policy, x = POLICIES[name](), 0.9 * X
+    x = x.float().double()
+    right = policy(x)
+    for made in (policy, copy.deepcopy(policy).float()):
+        found = made(x.float())
+        assert found.dtype == torch.float32
+        torch.testing.assert_close(found.double(), right, rtol=2e-6, atol=2e-6)
+
+
+@pytest.mark.compiled
+@pytest.mark.needs_compiler
+def test_a_compiled_program_serves_near_optimal_for_float32() -> None:
+    policy = copy.deepcopy(NEAR).float()
+    assert lanes.ready(policy, X.float())
+    found = policy(X.float())
+    assert found.dtype == torch.float32
+    torch.testing.assert_close(found.double(), NEAR(X), rtol=2e-6, atol=0)
+
+
+def test_plans_of_float32_states_are_those_of_float64_in_float32() -> None:
+    search = adp.BoxDDP(PROBLEM, steps=6, compile=False)
+    found, right = search.solve(X.float()), search.solve(X)
+    u, _ = PLANS.step(X.float(), PLANS.init(X.float()), X, 0.05)
+    assert {found.control.dtype, found.cost.dtype, u.dtype} == {torch.float32}
+    torch.testing.assert_close(found.cost.double(), right.cost, rtol=1e-6, atol=0)
+    torch.testing.assert_close(u.double(), PLANS.step(X, PLANS.init(X), X, 0.05)[0], rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("rows", [2, 3, 5, 7])
+def test_constraints_with_a_wall_a_row_are_refused_for_any_number_of_rows(rows: int) -> None:
+    walls = torch.linspace(0.5, 1.5, rows, dtype=torch.float64)
+    with pytest.raises(ValueError, match=r"`SafetyFilter\(constraints=...\)` number 0 .* row's own are not"):
+        adp.SafetyFilter(LQR, PLANT, lambda x, t: walls - x[:, 0], dt=0.05)
+
+
+@pytest.mark.parametrize("rows", [1, 2, 3, 4])
+def test_a_loop_with_a_gain_a_row_is_the_loops_of_its_rows(rows: int) -> None:
+    gains, x0 = torch.rand(rows, 2, dtype=torch.float64) + 1, torch.rand(rows, 2, dtype=torch.float64)
+
+    def cost(gain: Tensor, x: Tensor) -> Tensor:
+        policy = adp.Feedback(lambda x: -(gain * x).sum(-1, keepdim=True))
+        return adp.simulate(policy, CART, COST, x, dt=0.02, steps=8).cost
+
+    alone = torch.cat([cost(gains[k], x0[k : k + 1]) for k in range(rows)])
+    torch.testing.assert_close(cost(gains, x0), alone, rtol=1e-12, atol=0)
+
+
+class Own(systems.ControlAffineSystem):
+    dim, inputs = 2, 1
+
+    def __init__(self, mass: Tensor) -> None:
+        super().__init__()
+        self.mass = mass
+
+    def drift(self, x: Tensor) -> Tensor:
+        return torch.stack((x[..., 1], -x[..., 1] / self.mass), -1)
+
+    def effectiveness(self, x: Tensor) -> Tensor:
+        return torch.tensor([[0.0], [1.0]]).to(x).expand(*x.shape, 1)
+
+
+class Paid(adp.QuadraticCost):
+    def state_rate(self, x: Tensor) -> Tensor:
+        return 0.0  # type: ignore[return-value]
+
+
+def own(rows: int) -> Callable[[Tensor], Tensor]:
+    """V with a coefficient a row."""
+    numbers = torch.rand(rows, dtype=torch.float64)
+    return lambda x: numbers * x.square().sum(-1)
+
+
+PAID = r"`Paid.state_rate` must map rows \(5, 2\) to \(5,\), .* as a tensor; got 0.0"
+SIX = torch.rand(6, 4, 2, dtype=torch.float64)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: adp.simulate(LQR, Own(SIX[:3, 0, 0]), COST, X, dt=0.05, steps=2), "`Own.drift` must map"),
+        (lambda: adp.near_optimal(Own(SIX[:5, 0, 0]), COST, dt=0.05), "`Own.drift` must map"),
+        (lambda: st.chase(SIX, BASIS, own(6), LAW), "`<lambda>` must map points .* row's own"),
+        (lambda: st.StaF(BASIS, (6,)).fit_(SIX[:, 0], own(6)), "`<lambda>` must map points"),
+        (lambda: adp.SampledProblem.of(CART, COST, dt=0.1, terminal=own(2)), r"\(terminal=...\)` must map"),
+        (lambda: adp.QuadraticCost(1.0, 1.0, 2, 1, terminal=own(2)), r"\(terminal=...\)` must map"),
+        (lambda: adp.DirectShooting(CART, COST, horizon=1.0, terminal=own(2)), r"\(terminal=...\)` must map"),
+        (lambda: adp.hjb_residual(CART, COST, own(3), X), r"\(value=...\)` must map"),
+        (lambda: adp.LQR(PLANT, Paid(1.0, 1.0, 2, 1)), PAID),
+        (lambda: adp.simulate(LQR, PLANT, Paid(1.0, 1.0, 2, 1), X, dt=0.05, steps=2), PAID),
+        (lambda: adp.simulate(lambda x: x, CART, COST, X, dt=0.05, steps=2), r"to controls \(3, 1\)"),
+        (lambda: st.chase(SIX, BASIS, lambda x: x[..., 0] > 0, LAW), "floating point; got torch.bool"),
+        (lambda: BASIS.ideal_weights(X, lambda x: torch.complex(x, x)[..., 0]), "got torch.complex128"),
+        (lambda: torch.func.vmap(lambda s: st.chase(s, BASIS, square, LAW).estimate)(SIX[None]), "all rows"),
+    ],
+)
+def test_what_a_users_function_returns_is_that_of_rows_whatever_their_number(
+    call: Callable[[], object], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def test_no_rows_are_no_rows() -> None:
+    assert st.StaF(BASIS, (0,)).fit_(X[:0], targets.Paper()).coefficients.shape == (0, 6)
+    assert WALL(X[:0]).shape == (0, 1)
+    assert WALL.margins(X[:0]).shape == (0, 1)
+
+
+def step(x: Tensor, u: Tensor, row: tuple[Tensor]) -> tuple[Tensor, Tensor]:
+    x = x + 0.1 * (u - row[0] * x.sin())
+    return x, x
+
+
+U, GAIN = torch.rand(3, 5, dtype=torch.float64), torch.rand(3, dtype=torch.float64)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (
+            (X[:, 0], U[:2], (GAIN,)),
+            r"`Program\(now=...\)` must have 3 rows like `Program\(carry=...\)`; got",
+        ),
+        ((X[:, 0], U, (GAIN[:2],)), r"`Program\(row=...\)`, its row0, must have 3 rows"),
+        ((X[:, 0], (U, U[:, :2]), (GAIN,)), r"its now1, must have 5 times like `Program\(now=...\)`, its"),
+        ((X[:, 0].to("meta"), U, (GAIN,)), r"`Program\(now=...\)` must be on meta like"),
+        ((X[:, 0], U.to_sparse(), (GAIN,)), r"`Program\(now=...\)` must be dense"),
+        ((X[:, 0], U.numpy(), (GAIN,)), r"`Program\(now=...\)` must be a tree of tensors"),
+        ((X[0, 0], U, (GAIN,)), r"`Program\(carry=...\)` must begin with rows"),
+    ],
+)
+def test_a_program_reads_no_input_of_another_size_device_or_layout(given: Any, message: str) -> None:
+    program = lanes.Program(step)
+    program(X[:, 0], U, (GAIN,))  # compiled: what comes now is read by its address
+    with pytest.raises(ValueError, match=message):
+        program(*given)
+
+
+def test_programs_and_their_prepared_calls_are_copied_and_pickled_after_a_call() -> None:
+    program = lanes.Program(step)
+    prepared = program.prepare(X[:, 0], U, (GAIN,))
+    right = prepared(X[:, 0], U, (GAIN,))[1]
+    assert copy.deepcopy(program)(X[:, 0], U, (GAIN,))[1].equal(right)
+    assert copy.deepcopy(prepared)(X[:, 0], U, (GAIN,))[1].equal(right)
+
+
+def test_a_regressor_reads_no_address_of_a_tensor_without_numbers() -> None:
+    for kind in (st.StaFRegressor, online.MixtureRegressor):
+        fitted = kind().fit(SIX[:, 0].numpy(), SIX[:, 0, 0].numpy())
+        right = fitted.predict(X[0])
+        assert fitted.predict(torch.complex(0 * X[0], -X[0]).conj().imag).equal(right)
+        for given, message in (
+            (X[0].to("meta"), "on the device meta"),
+            (torch.tensor(1.0), "at least 1 dim"),
+        ):
+            with pytest.raises(ValueError, match=message):
+                fitted.predict(given)
+        torch.set_default_device("meta")
+        try:
+            assert math.isclose(fitted.predict(X[0].numpy()), float(right), rel_tol=1e-12)
+        finally:
+            torch.set_default_device(None)
+
+
+def test_designs_and_plans_are_made_beside_their_states_under_any_default_device() -> None:
+    right = adp.BoxDDP(PROBLEM, steps=6).solve(X).cost
+    torch.set_default_device("meta")
+    try:
+        cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        problem = adp.SampledProblem.of(systems.Pendulum(), cost, dt=0.05)
+        found = adp.BoxDDP(problem, steps=6).solve(X).cost
+        control = adp.RolloutPolicy.of_lqr(PLANT, cost, steps=4, horizon=0.2)(X)
+        loop = adp.simulate(adp.LQR(PLANT, cost), PLANT, cost, X, dt=0.05, steps=4).cost
+    finally:
+        torch.set_default_device(None)
+    torch.testing.assert_close(found, right, rtol=1e-9, atol=0)
+    torch.testing.assert_close(control, ROLLOUT.control(X), rtol=1e-9, atol=1e-12)
+    assert loop.equal(adp.simulate(LQR, PLANT, COST, X, dt=0.05, steps=4).cost)
