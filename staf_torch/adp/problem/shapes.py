@@ -67,4 +67,4 @@ def check_policy(call: str, name: str, cost: Cost, *policies: Function) -> None:
 
 def state_of(cost: Cost) -> Tensor:
     """A state to try functions at, (n,): the set-point, or the origin."""
-    return torch.zeros(cost.dim, dtype=torch.float64) if cost.target is None else cost.target
+    return torch.zeros(cost.dim, dtype=torch.float64, device="cpu") if cost.target is None else cost.target
