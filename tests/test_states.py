@@ -256,7 +256,7 @@ def test_a_regressor_reads_no_address_of_a_tensor_without_numbers() -> None:
         right = fitted.predict(X[0])
         assert fitted.predict(torch.complex(0 * X[0], -X[0]).conj().imag).equal(right)
         for given, message in (
-            (X[0].to("meta"), "on the device meta"),
+            (X[0].to("meta"), "meta"),
             (torch.tensor(1.0), "at least 1 dim"),
         ):
             with pytest.raises(ValueError, match=message):

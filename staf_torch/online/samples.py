@@ -9,11 +9,9 @@ import torch
 from torch import Tensor
 
 from ..lanes.gradients import refuse_gradient
-from ..numerics.checks import fail, trailing
-from ..numerics.default_device import beside
+from ..numerics.checks import fail
 
 
-@beside
 def tensor_of(call: str, name: str, value: Any) -> Tensor:
     """A tensor as it is; arrays and numbers as tensors; integers as float64."""
     if isinstance(value, Tensor):
@@ -43,8 +41,7 @@ def tensor_of(call: str, name: str, value: Any) -> Tensor:
             kind = ValueError if isinstance(error, ValueError) else kind
             told = fail(call, name, "must be a tensor or an array of numbers", value)
             raise (ValueError if isinstance(value, str) else kind)(f"{told} {error}") from error
-    found = found if found.is_floating_point() else found.double()
-    return trailing(call, name, found, 0, meta=False, vmap=False)
+    return found if found.is_floating_point() else found.double()
 
 
 def in_place(value: Any, dtype: torch.dtype | None, shape: tuple[int, ...]) -> bool:
