@@ -198,9 +198,7 @@ def test_what_cannot_follow_a_path_says_so() -> None:
         adp.DirectShooting(systems.Clocked(systems.Pendulum()), COST)
     with pytest.raises(ValueError, match=r"`held_stability\(at=...\)` must be a state of the path"):
         adp.held_stability(adp.LQR(PLANT, COST), PLANT, DT)
-    with pytest.raises(
-        ValueError, match=r"`TrackingCost\(path=...\)` must map times \(2,\) to states \(2, 2\)"
-    ):
+    with pytest.raises(ValueError, match=r"`TrackingCost\(path=...\)` must map rows \(5,\) to \(5, 2\)"):
         adp.TrackingCost(1.0, 1.0, dim=2, inputs=1, path=lambda t: t)
     library = adp.BoxDDP(PROBLEM, steps=5, compile=False).solve(X0)
     with pytest.raises(ValueError, match=r"`GlobalValue\(problem=...\)` must have a goal that stays"):
@@ -239,9 +237,9 @@ def test_a_cost_along_a_path_takes_bounds_angles_and_rest_from_its_plant() -> No
     assert own.around(plant).bounds is not None
     assert own.around(plant).bounds.high.tolist() == [1.5]  # type: ignore[union-attr]
     for wrong, shown in (
-        (lambda t: t, r"\(2,\)"),
+        (lambda t: t, r"\(5,\)"),
         (lambda t: 3.0, "3.0"),
         (lambda t: torch.ones(3, 2), r"\(3, 2\)"),
     ):
-        with pytest.raises(ValueError, match=rf"must map times \(2,\) to states \(2, 2\); got {shown}"):
+        with pytest.raises(ValueError, match=rf"must map rows \(5,\) to \(5, 2\), .*got {shown}"):
             adp.TrackingCost(1.0, 1.0, 2, 1, path=wrong)  # type: ignore[arg-type]
