@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from typing import Any, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
 
 from ..centers import StateFollowingCenters
 from ..kernels import Kernel
+from ..lanes.row_numbers import over_rows
+from ..lanes.row_objects import Rowwise
 from ..local_basis import Degrees, LocalBasis, LocalSpace
 from ..numerics.checks import sampled, trailing, values_of
 from .coefficient_format import compare, decode, encode, record
@@ -52,7 +54,7 @@ class GramStructure(NamedTuple):
         return quadratic
 
 
-class StaFBasis(nn.Module):
+class StaFBasis(nn.Module, metaclass=Rowwise):
     """The StaF basis sigma_i(y; x) = k(y, c_i(x)), i = 1..M.
 
     Example:
@@ -79,6 +81,13 @@ class StaFBasis(nn.Module):
     Source: Rosenfeld et al., section 2.
     """
 
+    rowwise: ClassVar = {
+        "forward": (2, 1),
+        "gram": (1,),
+        "ideal_weights": (1,),
+        "excess": (1, 1),
+        "values": (1,),
+    }
     _unseen = True  # until the first evaluation at the own state, where a constant one is reported
     _choose_again = False  # whether directions came without what fixes their local basis
     convention: Tensor
@@ -157,7 +166,7 @@ class StaFBasis(nn.Module):
         """The largest finite |x| nu(x) over the states (..., n); 0 for a kernel that does not mind."""
         if self.kernel.log_gain(x) is None:
             return 0.0
-        reach = (x.norm(dim=-1) * self.centers.radius(x)).detach()
+        reach = over_rows(lambda at: at.norm(dim=-1) * self.centers.radius(at), x).detach()
         known = torch.where(torch.isfinite(reach), reach, 0.0)
         return float(known.max()) if known.numel() else 0.0
 

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import abc
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 
+from ..lanes.row_objects import OfRows, Rowwise
 from ..numerics.checks import fail, hold, kept, non_negative, positive, shown, trailing, values_of
 
 
-class Radius(nn.Module, abc.ABC):
+class Radius(nn.Module, metaclass=OfRows):
     """nu(x) >= 0, the radius of the ball of centers at the state x.
 
     Example:
@@ -20,6 +22,7 @@ class Radius(nn.Module, abc.ABC):
         Shown by `staf centers.shrink.offset=0.01`.
     """
 
+    rowwise: ClassVar = {"forward": (1,)}
     constant: bool = False
 
     def bound(self) -> Tensor | None:
@@ -104,7 +107,7 @@ class StateRadius(Radius):
         return kept(self, "radius"), kept(self, "offset", zero=True), kept(self, "gain")
 
 
-class StateFollowingCenters(nn.Module):
+class StateFollowingCenters(nn.Module, metaclass=Rowwise):
     """c_i(x) = x + nu(x) u_i with directions u_i in the closed unit ball.
 
     Example:
@@ -124,6 +127,8 @@ class StateFollowingCenters(nn.Module):
 
     Source: Rosenfeld et al., section 2.
     """
+
+    rowwise: ClassVar = {"forward": (1,), "offsets": (1,)}
 
     def __init__(self, directions: Tensor, radius: float | Tensor | Radius) -> None:
         super().__init__()

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import fields
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from ..approximation.basis import StaFBasis, Target
-from ..lanes import Program
+from ..lanes import Program, Shared
 from ..lanes.opaque import opaque
+from ..lanes.row_numbers import over_rows
+from ..lanes.tree import plain
 from ..optim.base import UpdateLaw
 from ..signs import Sign
 from . import row_program
@@ -18,7 +21,7 @@ from .certificate import before_each, certify, first_link
 from .predictors import Predictor
 from .problem import Problem
 from .quantities import Known, know, numbers, precompute, with_certificate
-from .recursion import Corrected, Inputs, Recursion, kept_gain, last_weights, lost, recursion, start
+from .recursion import Carry, Corrected, Inputs, Recursion, kept_gain, last_weights, lost, recursion, start
 from .result import ChaseResult, ChaseWeights, concatenate
 
 _WORKING_BYTES = 2**26
@@ -184,7 +187,8 @@ class _ChaseRun:
 
     def __init__(self, problem: Problem, states: Tensor, weights: Tensor | None, *, everything: bool) -> None:
         self._problem, self._warned = problem, False
-        self.carry = start(problem, states, weights)
+        given = () if weights is None else (weights if weights.dim() > 1 else Shared(weights),)
+        self.carry = over_rows(lambda at, *w: start(problem, at, plain(w[0]) if w else None), states, *given)
         self._first = row_program.first_carry(problem, self.carry)
         self._unit = self._first.unit  # of the last chunk, bit by bit: a row that diverged stays as it was
         self._program = row_program.program(problem, states, self._first, everything=everything)
@@ -204,9 +208,14 @@ class _ChaseRun:
             assert recorded is not None
             return recorded
         self._warned = self._warned or self._problem.basis.check_reach(states, stacklevel=5)
-        known = know(self._problem, states, local=bool(self._problem.law.needs))
-        run, _ = self._corrected(known)
-        return run.after * (-kept_gain(known.log_gain, run.carry)).exp().unsqueeze(-1)
+
+        def defined(states: Tensor, carry: Carry) -> tuple[Tensor, Carry]:
+            known = know(self._problem, states, local=bool(self._problem.law.needs))
+            run, _ = self._corrected(known, carry)
+            return run.after * (-kept_gain(known.log_gain, run.carry)).exp().unsqueeze(-1), run.carry
+
+        found, self.carry = over_rows(defined, states, self.carry)
+        return found
 
     def results(self, states: Tensor) -> ChaseResult:
         """Return everything at the states (B, C, n)."""
@@ -221,25 +230,36 @@ class _ChaseRun:
                 result, found.certificate, torch.zeros_like(result.value, dtype=torch.bool)
             )
         self._warned = self._warned or problem.basis.check_reach(states, stacklevel=5)
-        known, link = know(problem, states, local=True), self.carry.link
-        run, inputs = self._corrected(known)
+
+        def defined(states: Tensor, carry: Carry) -> tuple[dict[str, Any], Carry]:
+            result, carry = self._defined(states, carry)
+            return {each.name: getattr(result, each.name) for each in fields(result)}, carry
+
+        every, self.carry = over_rows(defined, states, self.carry)
+        return ChaseResult(**every)
+
+    def _defined(self, states: Tensor, carry: Carry) -> tuple[ChaseResult, Carry]:
+        """Return everything at the states (B, C, n) by the definition, and the carry after them."""
+        problem, link = self._problem, carry.link
+        known = know(problem, states, local=True)
+        run, inputs = self._corrected(known, carry)
         gone = lost(run.carry, states.shape[1])
         at = Corrected(run.before, run.after, known.values, known.log_gain)
         unit = (-kept_gain(known.log_gain, run.carry)).exp()
         result = numbers(known, at, unit, gone).result(states, run.carry.diverged_at)
         if not problem.certificate:
-            return result
+            return result, run.carry
         assert known.local is not None
         ideal = known.local.ideal
         here = first_link(inputs.gram, known.log_gain, ideal)._replace(error=run.after - ideal)
         before = before_each(first_link(*(part[:, 0] for part in here)) if link is None else link, here)
         vouched, links = certify(problem, inputs.gram, at, ideal, before)
-        self.carry = self.carry._replace(link=type(links)(*(part[:, -1] for part in links)))
-        return with_certificate(result, vouched, gone)
+        after = run.carry._replace(link=type(links)(*(part[:, -1] for part in links)))
+        return with_certificate(result, vouched, gone), after
 
-    def _corrected(self, known: Known) -> tuple[Recursion, Inputs]:
+    def _corrected(self, known: Known, carry: Carry) -> tuple[Recursion, Inputs]:
         """Run the definition over a chunk."""
-        problem, carry = self._problem, self.carry
+        problem = self._problem
         inputs = Inputs.of(known.structure, known.values)
         inputs = inputs._replace(precomputed=precompute(problem, known, inputs.gram))
         if problem.predictor is not None:
@@ -248,9 +268,7 @@ class _ChaseRun:
             around = torch.cat((carry.states, known.state), dim=1)
             prepared = problem.predictor.prepare(problem.basis, problem.target, around, carry.time)
             inputs, carry = inputs._replace(prediction=prepared), carry._replace(states=around[:, -2:])
-        run = recursion(problem, inputs, carry)
-        self.carry = run.carry
-        return run, inputs
+        return recursion(problem, inputs, carry), inputs
 
     def _compiled(self, program: Program, states: Tensor, every: int) -> row_program.Outputs:
         """Run the program over a chunk; within it times count from 0, or from 2 where others were before."""

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import abc
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 
+from ..lanes.row_objects import OfRows
 from ..numerics.checks import shown
 
 
-class Kernel(nn.Module, abc.ABC):
+class Kernel(nn.Module, metaclass=OfRows):
     """A real, symmetric, positive definite kernel k(y, c).
 
     A kernel of your own is a subclass with `forward` alone; gradients come from autograd. The other
@@ -34,6 +36,12 @@ class Kernel(nn.Module, abc.ABC):
         Shown by `staf kernel=custom kernel.path=staf_torch.MaternKernel`.
     """
 
+    rowwise: ClassVar = {
+        **dict.fromkeys(("forward", "anchored"), (2, 2)),
+        **dict.fromkeys(("gradient", "anchored_gradient"), (2, 2, 1)),
+        **dict.fromkeys(("log_scale", "log_scale_gradient"), (1, 2)),
+        **{"core": (1, 2, 2), "core_gradient": (1, 2, 2, 1), "log_gain": (1,), "follow": (2, 2)},
+    }
     state_free: bool = False
     scale_slope: float | None = None
     """q where s(x, z) = q x'z plus a function of z alone, None where s has another form."""

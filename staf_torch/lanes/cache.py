@@ -34,6 +34,7 @@ from torch import Tensor
 
 from .contents import is_users
 from .emit.cpp import Text
+from .row_numbers import RowNumbers
 from .trace.captured_tensors import Recipe
 from .trace.captured_tensors import tensors as tensors_of
 
@@ -77,6 +78,7 @@ class Trace(NamedTuple):
     real: torch.dtype
     outputs: tuple[tuple[torch.Size, torch.dtype], ...]
     structure: Any
+    rows: tuple[RowNumbers, ...]
 
 
 def place(*described: object) -> Path:
@@ -104,7 +106,7 @@ def load(path: Path, tensors: Sequence[Tensor]) -> Trace | None:
 def save(path: Path, trace: Trace, tensors: Sequence[Tensor]) -> None:
     """Write a trace, unless its numbers follow from more than these tensors."""
     places = {id(tensor): k for k, tensor in enumerate(tensors)}
-    if any(id(tensor) not in places for tensor in trace.recipe.found):
+    if any(id(tensor) not in places for tensor in (*trace.recipe.found, *trace.rows)):
         return
     file = io.BytesIO()
     try:

@@ -19,6 +19,7 @@ from torch.autograd import forward_ad
 
 from ..signs import Sign
 from .compiler import compiled
+from .row_numbers import RowNumbers, columns
 from .tree import Shared, Tree, flatten, labels, plain, unflatten
 
 LARGE = 2**22  # bytes from which pages of two megabytes are worth asking for
@@ -73,6 +74,7 @@ class Compiled(NamedTuple):
     carry: tuple[tuple[torch.Size, torch.dtype], ...]  # of one row
     outputs: tuple[tuple[torch.Size, torch.dtype], ...]
     structure: Any  # of the outputs
+    rows: tuple[RowNumbers, ...] = ()  # whose columns follow what a row has once
 
 
 def ordinary(leaves: Sequence[Any]) -> bool:
@@ -117,6 +119,7 @@ class PlannedCall:
         leaves: examples of the inputs: what a row has once, what times bring, the carry.
         times: for each of them, whether a dimension of times comes first (after the rows).
         rows, steps, every: of the call.
+        once: how many of the leaves a row has once.
 
     Attributes:
         structure: of the outputs.
@@ -132,8 +135,12 @@ class PlannedCall:
         rows: int,
         steps: int,
         every: int,
+        once: int = 0,
     ) -> None:
         self._compiled, self.structure, self._rows_and_times = compiled, compiled.structure, rows * steps
+        self._rows, self._once = rows, once
+        if compiled.rows:
+            leaves, times = self._with_columns(leaves), [*[False] * len(compiled.rows), *times]
         self._copied: list[int] = []  # inputs of another dtype, or without one stride from entry to entry
         self._large: list[int] = []
         slots = [
@@ -181,8 +188,10 @@ class PlannedCall:
             leaves: inputs of the forms that the examples had.
         """
         given, real = leaves, self._compiled.real
+        if self._compiled.rows:
+            given = self._with_columns(leaves)
         if not self.direct:
-            given = [leaf.tensor if type(leaf) is Shared else leaf for leaf in leaves]
+            given = [leaf.tensor if type(leaf) is Shared else leaf for leaf in given]
             for k in self._copied:
                 given[k] = given[k].to(real).contiguous()
         empty = torch.empty_strided
@@ -199,6 +208,9 @@ class PlannedCall:
         for k, dtype in self._dtypes:
             rooms[k] = rooms[k].to(dtype)
         return rooms
+
+    def _with_columns(self, leaves: Sequence[Any]) -> list[Any]:
+        return [*leaves[: self._once], *columns(self._compiled.rows, self._rows), *leaves[self._once :]]
 
 
 _address = Tensor.data_ptr

@@ -30,8 +30,9 @@ from .one_thread import ENTRIES, alone
 from .opaque import opaque
 from .plain_time import PlainTime
 from .program import Program
+from .row_numbers import RowNumbers, over_rows, points_of_rows
 from .shared_programs import shared_program
-from .tree import Tree, flatten, unflatten
+from .tree import Shared, Tree, flatten, plain, unflatten
 
 _PAYS = 100  # calls of a small batch in plain torch after which it is compiled, however short they are
 _SOON = 30  # calls
@@ -189,7 +190,7 @@ class CompiledMethod:
         if read is None or not read.unchanged(library=False):
             read = self._compile(trees=bool(more))
         if read.wants_gradient():  # of what the owner holds
-            return self.definition(x, *more)
+            return self._defined(x, *more)
         if (served := self._served) is None:  # no longer
             self._compile(trees=bool(more))
             served = self._served
@@ -199,7 +200,11 @@ class CompiledMethod:
             return served(x, *more)
         dims = x.dim()
         try:
-            y = served(x if dims <= 2 else x.reshape(-1, x.shape[-1]))
+            if dims > 2:
+                with points_of_rows(len(x), x.shape[1:-1].numel()):
+                    y = served(x.reshape(-1, x.shape[-1]))
+            else:
+                y = served(x)
         except (RuntimeError, ValueError):
             self._refused(x)
             raise
@@ -221,6 +226,10 @@ class CompiledMethod:
 
     def _defined(self, x: Tensor, *more: Tree) -> Any:
         """Compute by the definition, with new tensors beside x whatever the default device is."""
+        if RowNumbers.made:
+            return over_rows(
+                lambda at, *rest: self.definition(plain(at), *rest), Shared(x) if x.dim() < 2 else x, *more
+            )
         if _device.CURRENT_DEVICE is None or not isinstance(x, Tensor):
             return self.definition(x, *more)
         with torch.device(x.device):
@@ -228,7 +237,7 @@ class CompiledMethod:
 
     def _refused(self, x: Tensor, *more: Tree) -> Any:
         """Raise what the definition says of x, or that no state is an integer, a flag or a single number."""
-        found = self.definition(x, *more)
+        found = self._defined(x, *more)
         if _is_state(x):
             return found
         name = f"{type(self.owner).__name__}.{self.definition.__name__}"

@@ -32,6 +32,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from .row_numbers import RowNumbers, all_rows
+
 _PACKAGE = __name__.partition(".")[0]
 _OF_PYTHON = frozenset(sys.stdlib_module_names) - {"__main__"}
 _FOLDERS = tuple(Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib", "purelib", "platlib"))
@@ -87,6 +89,7 @@ def version(tensor: Tensor) -> int:
 
     Torch counts writes, but not those to tensors made in inference mode: of these it is the content.
     """
+    tensor = all_rows(tensor)
     return hash(tensor.numpy(force=True).tobytes()) if tensor.is_inference() else tensor._version
 
 
@@ -119,7 +122,7 @@ class Contents:
         classes = [kind for kind in dict.fromkeys(kinds) if kind is not object]
         self._users = [vars(kind) for kind in classes if is_users(kind)]
         self._library = [vars(kind) for kind in classes if not is_users(kind)]
-        found = [*walk.tensors, *walk.others]
+        found = [*map(all_rows, walk.tensors), *walk.others]
         self._changeable = [tensor for tensor in found if not tensor.is_inference()]
         self._versions = [tensor._version for tensor in self._changeable]
         self._of_inference = [(tensor, version(tensor)) for tensor in found if tensor.is_inference()]
@@ -414,7 +417,8 @@ class Walk(pickle.Pickler):
             self._places[id(value)] = len(self.tensors)
             self.tensors.append(value)
         place = self._places[id(value)]
-        return place, str(value.dtype), str(value.device), tuple(value.shape), value.stride()
+        own = isinstance(value, RowNumbers)  # how many rows there are is no matter
+        return place, own, str(value.dtype), str(value.device), tuple(value.shape), value.stride()
 
     def _note(self, value: Any) -> None:
         """Note what may change inside of an object; a module is noted in `reducer_override`."""

@@ -22,6 +22,7 @@ from .loops import scan, tracing_now
 from .one_thread import ENTRIES, alone
 from .opaque import opaque
 from .row_independence import doubt, undrawn
+from .row_numbers import RowNumbers, over_rows, points_of_rows
 from .trace.step import Step, trace
 from .trace.tracer import NotLoweredError
 from .tree import Shared, Tree, flatten, labels, plain, unflatten
@@ -164,7 +165,8 @@ class Program(Derived):
         shape = points[0].shape[:2]
         spread = [part.unsqueeze(1).expand(*shape, *part.shape[1:]) for part in fixed]
         rows = tuple(part.flatten(0, 1) for part in (*spread, *points))
-        leaves, structure = flatten(self((), (), rows, steps=1)[1])
+        with points_of_rows(*shape):
+            leaves, structure = flatten(self((), (), rows, steps=1)[1])
         return unflatten(structure, iter([leaf[:, 0].unflatten(0, shape) for leaf in leaves]))
 
     def prepare(
@@ -183,7 +185,13 @@ class Program(Derived):
         self, carry: Tree, now: Tree = (), row: Tree = (), *, steps: int | None = None, every: int = 1
     ) -> tuple[Tree, Tree]:
         """Compute in plain torch."""
-        given = Given.of(carry, now, row, steps)
+
+        def all_times(carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
+            return self._all_times(Given.of(carry, now, row, steps), carry, every)
+
+        return over_rows(all_times, carry, now, row)
+
+    def _all_times(self, given: Given, carry: Tree, every: int) -> tuple[Tree, Tree]:
         fixed = given.tree("row", [plain(leaf) for leaf in given.row])
         columns: list[list[Tensor]] = []
         shape: Any = ("fixed", ())
@@ -305,7 +313,11 @@ class Program(Derived):
         numbers = None if built is None else built.trace.recipe.again(others)
         if built is None or numbers is None:
             return None
-        compiled = built.compiled._replace(table=built.trace.text.numbers(numbers, built.compiled.real))
+        table = built.trace.text.numbers(numbers, built.compiled.real)
+        rows = tuple(others.get(id(each), each) for each in built.trace.rows)
+        if not all(isinstance(each, RowNumbers) for each in rows):
+            return None
+        compiled = built.compiled._replace(table=table, rows=rows)
         return built._replace(compiled=compiled)
 
     def _build(self, given: Given, copies: int) -> _Built | None:
@@ -326,7 +338,7 @@ class Program(Derived):
             self._read.warn(self.name)
         table = made.text.numbers(made.recipe.values, made.real)
         shapes = tuple((leaf.shape[1:], leaf.dtype) for leaf in given.carry)
-        return _Built(Compiled(call, table, made.real, shapes, made.outputs, made.structure), made)
+        return _Built(Compiled(call, table, made.real, shapes, made.outputs, made.structure, made.rows), made)
 
     def _known(self, given: Given, copies: int) -> Trace:
         """Return the trace of the step with a single row, from the cache where it has been traced before."""
@@ -369,7 +381,7 @@ def _written(step: Step, given: Given, copies: int) -> Trace:
         real = torch.float64
         traced = trace(step, given, widened=True)
         text = emit(*traced.program, copies)
-    return Trace(text, traced.recipe, real, traced.outputs, traced.structure)
+    return Trace(text, traced.recipe, real, traced.outputs, traced.structure, traced.rows)
 
 
 class _Built(NamedTuple):
@@ -418,7 +430,13 @@ class Prepared:
                 return self.run(leaves, carry, now, row)
             times = [False] * len(given.row) + [True] * len(given.now) + [False] * len(given.carry)
             self.plan = PlannedCall(
-                compiled, leaves, times, rows=given.rows, steps=given.times, every=self._every
+                compiled,
+                leaves,
+                times,
+                rows=given.rows,
+                steps=given.times,
+                every=self._every,
+                once=len(given.row),
             )
         rooms = iter(self.plan(leaves))
         return unflatten(self._carry, rooms), unflatten(self.plan.structure, rooms)

@@ -19,7 +19,8 @@ from torch import Tensor
 
 from .call import Given
 from .loops import few_passes
-from .tree import Shared, flatten, plain
+from .row_numbers import over_rows, some_rows
+from .tree import Shared, Tree, flatten, plain, unflatten
 
 _BITS = (1, -1, 3, -5, 17)  # units in the last place by which inputs are moved
 _CLOSE = 1e-2  # of the largest entry: far above what another order of sums does to an ill-conditioned row
@@ -114,7 +115,7 @@ def _called(step: Callable[..., Any], given: Given, rows: Sequence[int], bits: i
 
     def few(leaf: Any, time: bool) -> Any:
         if isinstance(leaf, Shared):
-            return moved(leaf.tensor[0] if time else plain(leaf)).clone()
+            return Shared(moved(leaf.tensor[0] if time else plain(leaf)).clone())
         return moved((leaf[:, 0] if time else leaf)[rows])
 
     def moved(leaf: Tensor) -> Tensor:
@@ -126,8 +127,13 @@ def _called(step: Callable[..., Any], given: Given, rows: Sequence[int], bits: i
         given.tree(name, [few(leaf, name == "now") for leaf in getattr(given, name)])
         for name in ("carry", "now", "row")
     )
-    with few_passes():
-        return flatten(step(carry, now, row))[0]
+
+    def plainly(*given: Tree) -> Tree:
+        leaves, structure = flatten(given)
+        return step(*unflatten(structure, iter([plain(leaf) for leaf in leaves])))
+
+    with few_passes(), some_rows(torch.tensor(rows, dtype=torch.int64)):
+        return flatten(over_rows(plainly, carry, now, row))[0]
 
 
 def _leaves_are_close(found: Tensor, other: Tensor, tolerance: float = 0.0) -> bool:

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from ..lanes.gradients import refuse_gradient
+from ..lanes.row_numbers import RowNumbers, all_rows
 from . import COMMAND_LINE as COMMAND_LINE
 from . import fail as fail
 from . import show
@@ -27,9 +28,7 @@ def number(call: str, name: str, value: object) -> float | Tensor:
     if isinstance(value, Tensor):
         if not value.is_floating_point():
             raise fail(call, name, "must be a floating-point tensor", value)
-        if not value.is_meta and not bool(torch.isfinite(value).all()):
-            raise fail(call, name, "must be finite", value)
-        return value
+        return _in_all_rows(call, name, value, torch.isfinite, "must be finite")
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise fail(call, name, "must be a number", value)
     if not math.isfinite(value):
@@ -54,9 +53,7 @@ def positive(call: str, name: str, value: object) -> Tensor:
         dtype=None if isinstance(checked, Tensor) else torch.float64,
         device=getattr(checked, "device", "cpu"),
     )
-    if not tensor.is_meta and not bool((tensor > 0).all()):
-        raise fail(call, name, "must be positive", value)
-    return tensor
+    return _in_all_rows(call, name, tensor, lambda x: x > 0, "must be positive", value)
 
 
 def non_negative(call: str, name: str, value: object) -> Tensor:
@@ -67,9 +64,42 @@ def non_negative(call: str, name: str, value: object) -> Tensor:
         dtype=None if isinstance(checked, Tensor) else torch.float64,
         device=getattr(checked, "device", "cpu"),
     )
-    if not tensor.is_meta and not bool((tensor >= 0).all()):
-        raise fail(call, name, "must not be negative", value)
-    return tensor
+    return _in_all_rows(call, name, tensor, lambda x: x >= 0, "must not be negative", value)
+
+
+def _in_all_rows(
+    call: str, name: str, value: Tensor, holds: Callable[[Tensor], Tensor], rule: str, given: object = None
+) -> Tensor:
+    """Return a tensor whose entries obey a rule, with the first row that breaks it where rows have their own."""
+    numbers = all_rows(value)
+    if numbers.is_meta or bool((held := holds(numbers)).all()):
+        return value
+    if numbers is value:
+        raise fail(call, name, rule, value if given is None else given)
+    row = int((~held.reshape(len(held), -1).all(-1)).nonzero()[0])
+    raise fail(call, name, f"{rule} in every row, which it is not in row {row}", numbers[row])
+
+
+def own_number(call: str, name: str, value: object, sign: str = "any") -> Any:
+    """Return a finite number, or a tensor of one: of `rows`, one a row.
+
+    Args:
+        call: in whose name an error speaks.
+        name: of the argument.
+        value: a number, or a tensor without dimensions.
+        sign: ``positive``, ``not negative`` or ``any``.
+    """
+    checked = number(call, name, value)
+    if isinstance(checked, Tensor) and checked.dim():
+        raise fail(call, name, "must be one number, or one a row by `rows`", value)
+    if sign != "any":
+        (positive if sign == "positive" else non_negative)(call, name, checked)
+    return checked
+
+
+def keep(module: nn.Module, name: str, value: Any) -> Any:
+    """Hold a number of a module, by `hold` where it is a tensor."""
+    return hold(module, name, value) if isinstance(value, Tensor) else value
 
 
 def positive_real(call: str, name: str, value: object) -> float:
@@ -279,7 +309,7 @@ def values_of(tensor: Tensor) -> Tensor | None:
     """Return the numbers of a tensor, also inside a transform of `torch.func`; None in a tracer."""
     if tensor.is_meta or torch.compiler.is_compiling() or torch._C._len_torch_dispatch_stack():
         return None
-    plain = tensor.detach()
+    plain = all_rows(tensor).detach()
     while torch._C._functorch.is_functorch_wrapped_tensor(plain):
         plain = torch._C._functorch.get_unwrapped(plain)
     return plain
@@ -295,7 +325,13 @@ def copied(module: Module, **buffers: Tensor) -> Module:
 def shown(module: nn.Module) -> str:
     """The module's own tensors for its repr: numbers by value, others by shape."""
     own = [(n, t) for n, t in (*module._parameters.items(), *module._buffers.items()) if t is not None]
-    return ", ".join(
-        f"{name}={float(t.detach()):.6g}" if t.dim() == 0 and not t.is_meta else f"{name}={tuple(t.shape)}"
-        for name, t in own
-    )
+    return ", ".join(f"{name}={_shown(t)}" for name, t in own)
+
+
+def _shown(tensor: Tensor) -> str:
+    numbers = all_rows(tensor.detach())
+    if numbers.is_meta or tensor.dim():
+        return str(tuple(tensor.shape))
+    if isinstance(tensor, RowNumbers):
+        return f"rows({float(numbers[0]):.6g} ... {float(numbers[-1]):.6g})"
+    return f"{float(numbers):.6g}"

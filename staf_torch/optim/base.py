@@ -9,13 +9,14 @@ import torch
 from torch import Tensor
 
 from ..lanes import repeat
+from ..lanes.row_objects import OfRows
 from .objective import Objective
 
 LawState = tuple[Tensor, ...]
 """What a law carries from one iteration to the next: tensors (...), (..., M) or (..., M, M) a row."""
 
 
-class UpdateLaw(abc.ABC):
+class UpdateLaw(metaclass=OfRows):
     """A pure iteration on a quadratic: state goes in as an argument and comes out as a value.
 
     A law object holds hyperparameters only. Rows never touch each other.

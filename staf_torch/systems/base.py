@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import abc
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
+from ..lanes.row_objects import OfRows
 from ..numerics.angles import wrap
 from ..numerics.checks import trailing
 from ..numerics.shown import limits, settings, sizes
 from .bounds import Bounds
+
+Number = float | Tensor
+"""A number, as a tensor without dimensions one of a table, or by `staf_torch.rows` one a row."""
 
 
 class Linearisation(NamedTuple):
@@ -56,7 +60,7 @@ def _each(units: str, count: int) -> tuple[str, ...]:
     return words if len(words) == count else (words * count if len(words) == 1 else (units,) * count)
 
 
-class Plant(nn.Module, abc.ABC):
+class Plant(nn.Module, metaclass=OfRows):
     """A plant with inputs, batched: what the ones in continuous and in discrete time have in common.
 
     Example:
@@ -76,6 +80,13 @@ class Plant(nn.Module, abc.ABC):
         period: time that a control is held at least, s: the step of a plant in discrete time, else None.
     """
 
+    rowwise: ClassVar = {
+        **dict.fromkeys(("drift", "effectiveness", "smooth_drift"), (1,)),
+        **dict.fromkeys(
+            ("rate", "motion", "velocity", "displaced", "step_limit", "step", "difference"), (1, 1)
+        ),
+        "flow": (1, 9),  # the times are for all rows
+    }
     dim: int | None = None
     inputs: int = 0
     units: Units = Units()

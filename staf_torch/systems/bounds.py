@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from ..lanes.row_numbers import all_rows
 from ..numerics.checks import fail, numbers_of
 
 Limit = float | Sequence[float] | Tensor | None
@@ -67,7 +68,8 @@ class Bounds:
         return Bounds(self.low - u, self.high - u, len(self.low))
 
     def __repr__(self) -> str:
-        return f"Bounds(low={self.low.tolist()}, high={self.high.tolist()})"
+        low, high = all_rows(self.low).tolist(), all_rows(self.high).tolist()
+        return f"Bounds(low={low}, high={high})"
 
 
 def _limit(name: str, given: Limit, none: float, inputs: int) -> Tensor:

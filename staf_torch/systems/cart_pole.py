@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..numerics.checks import positive_real
-from .base import ControlAffineSystem, Units
+from ..numerics.checks import keep, own_number
+from .base import ControlAffineSystem, Number, Units
 
 
 class CartPole(ControlAffineSystem):
@@ -42,13 +42,14 @@ class CartPole(ControlAffineSystem):
     periodic = (1,)
 
     def __init__(
-        self, cart: float = 1.0, pole: float = 0.1, half_length: float = 0.5, gravity: float = 9.81
+        self, cart: Number = 1.0, pole: Number = 0.1, half_length: Number = 0.5, gravity: Number = 9.81
     ) -> None:
         super().__init__()
-        self.pole = positive_real("CartPole", "pole", pole)
-        self.total = positive_real("CartPole", "cart", cart) + pole
-        self.half_length = positive_real("CartPole", "half_length", half_length)
-        self.gravity = positive_real("CartPole", "gravity", gravity)
+        self.pole = keep(self, "pole", own_number("CartPole", "pole", pole, "positive"))
+        self.total = keep(self, "total", own_number("CartPole", "cart", cart, "positive") + self.pole)
+        half_length = own_number("CartPole", "half_length", half_length, "positive")
+        self.half_length = keep(self, "half_length", half_length)
+        self.gravity = keep(self, "gravity", own_number("CartPole", "gravity", gravity, "positive"))
 
     def drift(self, x: Tensor) -> Tensor:
         _, angle, speed, turning = x.unbind(-1)

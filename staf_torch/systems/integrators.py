@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import math
 from collections.abc import Iterator
@@ -13,6 +14,7 @@ from ..lanes import Program, repeat, shared_program
 from ..lanes.compiled_methods import undecided, worth
 from ..lanes.loop_program import LoopProgram
 from ..lanes.opaque import opaque
+from ..lanes.row_numbers import over_rows, over_some_rows, some_rows
 from ..lanes.tree import Tree
 from ..numerics.checks import integer, positive_real, trailing
 from ..numerics.default_device import beside
@@ -66,14 +68,14 @@ def trajectory(
     for start in range(0, total, size):
         stop = min(start + size, total)
         time = torch.arange(start, stop, dtype=torch.float64, device="cpu") * dt
-        exact = flow(x0, time) if flow is not None else None
+        exact = over_rows(functools.partial(flow, time=time), x0) if flow is not None else None
         if exact is not None:
             yield exact
             continue
         (after, bent, reach), piece = program((x, none, none), steps=stop - start)
         if bool(bent.isnan().all()):  # by plain torch, which takes as long for all states at once as for one
-            some = piece.split(max(1, _TOGETHER // piece.shape[1]))
-            bent = torch.cat([_advanced(system, part, dt, 1)[1].amax(1) for part in some])
+            some = torch.arange(len(x0)).split(max(1, _TOGETHER // piece.shape[1]))
+            bent = torch.cat([_advanced_rows(system, k, piece[k], dt, 1)[1].amax(1) for k in some])
             reach = piece.abs().amax(-1).amax(1)
         strained = ~(bent <= BENT * reach) & torch.isfinite(reach)
         if bool(strained.any()):
@@ -127,19 +129,26 @@ def _advanced(system: ControlAffineSystem, x: Tensor, dt: float, count: int) -> 
     return found
 
 
+def _advanced_rows(
+    system: ControlAffineSystem, rows: Tensor, x: Tensor, dt: float, count: int
+) -> tuple[Tensor, Tensor]:
+    """The result of `_advanced` at states (R, ..., n) of these rows (R,) of all."""
+    return over_some_rows(lambda at: _advanced(system, at, dt, count), rows, x)
+
+
 def _refined(
     system: ControlAffineSystem, dt: float, x: Tensor, after: Tensor, piece: Tensor, rows: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return the end and the states of a piece in which these rows (R,) took the steps that they need."""
     states = piece[rows]
-    bent = _advanced(system, states, dt, 1)[1].nan_to_num(math.inf, math.inf)
+    bent = _advanced_rows(system, rows, states, dt, 1)[1].nan_to_num(math.inf, math.inf)
     bent = torch.where(torch.isfinite(states).all(-1), bent, -1.0)
     at = bent.topk(min(TRIED, bent.shape[1]), dim=1).indices.unsqueeze(-1)
     tried = states.gather(1, at.expand(-1, -1, x.shape[-1]))
     known = torch.isfinite(tried).all(-1)
 
     def errors(some: Tensor, times: int) -> Tensor:
-        now, better = (_advanced(system, tried[some], dt, k * times)[0] for k in (1, 2))
+        now, better = (_advanced_rows(system, rows[some], tried[some], dt, k * times)[0] for k in (1, 2))
         size = torch.maximum(tried[some].abs(), better.abs().nan_to_num(0.0, 0.0)).amax(-1)
         wrong = torch.where(known[some], (now - better).abs().amax(-1), 0.0).amax(1)
         return (wrong / torch.where(known[some], size, 0.0).amax(1)).nan_to_num(math.inf, math.inf)
@@ -151,7 +160,8 @@ def _refined(
         if factor > 1:
             begun = x[chosen], torch.zeros_like(x[chosen, 0]), torch.zeros_like(x[chosen, 0])
             times = piece.shape[1]
-            (end, _, _), again = _stepped(system, dt, factor, times, len(chosen))(begun, steps=times)
+            with some_rows(chosen):
+                (end, _, _), again = _stepped(system, dt, factor, times, len(chosen))(begun, steps=times)
             after, piece = after.index_copy(0, chosen, end), piece.index_copy(0, chosen, again)
     wrong = found.error > GRACE * TOLERANCE
     if bool(wrong.any()):

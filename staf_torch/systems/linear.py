@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ..numerics.checks import fail, hold, numbers_of, vector
+from ..lanes.row_numbers import RowNumbers
+from ..numerics.checks import fail, hold, number, numbers_of, vector
 from ..numerics.linalg import exponential, riccati
 from .base import ControlAffineSystem
 
@@ -36,14 +37,12 @@ class Linear(ControlAffineSystem):
         input_matrix: Sequence[Sequence[float]] | Tensor | None = None,
     ) -> None:
         super().__init__()
-        rows = _rows("matrix", matrix, "must be (n, n)")
-        self.dim = len(rows)
-        self.matrix = hold(self, "matrix", _stack("matrix", rows, self.dim))
+        self.matrix = hold(self, "matrix", _stack("matrix", matrix, "must be (n, n)"))
+        self.dim = len(self.matrix)
         inputs = [[]] * self.dim if input_matrix is None else input_matrix
-        given = _rows("input_matrix", inputs, "must be (n, m)")
-        if len(given) != self.dim:
+        self.input_matrix = hold(self, "input_matrix", _stack("input_matrix", inputs, "must be (n, m)"))
+        if len(self.input_matrix) != self.dim:
             raise fail("Linear", "input_matrix", f"must have {self.dim} rows, one a state", input_matrix)
-        self.input_matrix = hold(self, "input_matrix", _stack("input_matrix", given, len(given[0])))
         self.inputs = self.input_matrix.shape[1]
 
     def drift(self, x: Tensor) -> Tensor:
@@ -74,7 +73,14 @@ def _rows(name: str, matrix: object, rule: str) -> Sequence[Sequence[float]]:
     return rows
 
 
-def _stack(name: str, rows: Sequence[Sequence[float]], length: int) -> Tensor:
+def _stack(name: str, matrix: object, rule: str) -> Tensor:
+    if isinstance(matrix, RowNumbers):
+        if matrix.dim() != 2 or (name == "matrix" and len(matrix) != matrix.shape[1]):
+            raise fail("Linear", name, rule, tuple(matrix.shape))
+        number("Linear", name, matrix)
+        return matrix.double()
+    rows = _rows(name, matrix, rule)
+    length = len(rows) if name == "matrix" else len(rows[0])
     return torch.tensor(
         [vector("Linear", name, row, length) for row in rows], dtype=torch.float64, device="cpu"
     )

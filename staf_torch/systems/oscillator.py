@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..numerics.checks import positive_real
-from .base import ControlAffineSystem
+from ..numerics.checks import keep, own_number
+from .base import ControlAffineSystem, Number
 
 
 class Oscillator(ControlAffineSystem):
@@ -31,9 +31,9 @@ class Oscillator(ControlAffineSystem):
 
     dim = 2
 
-    def __init__(self, frequency: float = 1.0) -> None:
+    def __init__(self, frequency: Number = 1.0) -> None:
         super().__init__()
-        self.frequency = positive_real("Oscillator", "frequency", frequency)
+        self.frequency = keep(self, "frequency", own_number("Oscillator", "frequency", frequency, "positive"))
 
     def drift(self, x: Tensor) -> Tensor:
         x1, x2 = x.unbind(-1)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..numerics.checks import non_negative, positive_real, real
-from .base import ControlAffineSystem, Units
+from ..numerics.checks import keep, own_number
+from .base import ControlAffineSystem, Number, Units
 
 
 class Pendulum(ControlAffineSystem):
@@ -37,14 +37,15 @@ class Pendulum(ControlAffineSystem):
     spread = 0.5
 
     def __init__(
-        self, mass: float = 1.0, length: float = 1.0, damping: float = 0.1, gravity: float = 9.81
+        self, mass: Number = 1.0, length: Number = 1.0, damping: Number = 0.1, gravity: Number = 9.81
     ) -> None:
         super().__init__()
-        mass = positive_real("Pendulum", "mass", mass)
-        self.inertia = mass * positive_real("Pendulum", "length", length) ** 2
-        non_negative("Pendulum", "damping", damping)
-        self.damping = real("Pendulum", "damping", damping)
-        self.stiffness = positive_real("Pendulum", "gravity", gravity) / length  # 1/s^2
+        mass = own_number("Pendulum", "mass", mass, "positive")
+        length = own_number("Pendulum", "length", length, "positive")
+        gravity = own_number("Pendulum", "gravity", gravity, "positive")
+        self.inertia = keep(self, "inertia", mass * length**2)
+        self.damping = keep(self, "damping", own_number("Pendulum", "damping", damping, "not negative"))
+        self.stiffness = keep(self, "stiffness", gravity / length)  # 1/s^2
 
     def drift(self, x: Tensor) -> Tensor:
         angle, rate = x.unbind(-1)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..numerics.checks import positive_real
-from .base import ControlAffineSystem, Units
+from ..numerics.checks import keep, own_number
+from .base import ControlAffineSystem, Number, Units
 
 
 class PlanarQuadrotor(ControlAffineSystem):
@@ -38,11 +38,10 @@ class PlanarQuadrotor(ControlAffineSystem):
     units = Units("m, m, rad, m/s, m/s, rad/s", "N above hover, N m")
     spread = 0.2
 
-    def __init__(self, mass: float = 1.0, inertia: float = 0.1, gravity: float = 9.81) -> None:
+    def __init__(self, mass: Number = 1.0, inertia: Number = 0.1, gravity: Number = 9.81) -> None:
         super().__init__()
-        self.mass = positive_real("PlanarQuadrotor", "mass", mass)
-        self.inertia = positive_real("PlanarQuadrotor", "inertia", inertia)
-        self.gravity = positive_real("PlanarQuadrotor", "gravity", gravity)
+        for name, value in (("mass", mass), ("inertia", inertia), ("gravity", gravity)):
+            setattr(self, name, keep(self, name, own_number("PlanarQuadrotor", name, value, "positive")))
 
     def drift(self, x: Tensor) -> Tensor:
         angle = x[..., 2]

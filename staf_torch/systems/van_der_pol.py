@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..numerics.checks import real
-from .base import ControlAffineSystem
+from ..numerics.checks import keep, own_number
+from .base import ControlAffineSystem, Number
 
 
 class VanDerPol(ControlAffineSystem):
@@ -29,9 +29,9 @@ class VanDerPol(ControlAffineSystem):
     dim = 2
     inputs = 1
 
-    def __init__(self, damping: float = 1.0) -> None:
+    def __init__(self, damping: Number = 1.0) -> None:
         super().__init__()
-        self.damping = real("VanDerPol", "damping", damping)
+        self.damping = keep(self, "damping", own_number("VanDerPol", "damping", damping))
 
     def drift(self, x: Tensor) -> Tensor:
         x1, x2 = x.unbind(-1)

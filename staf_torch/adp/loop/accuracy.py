@@ -13,6 +13,7 @@ import math
 import torch
 from torch import Tensor, nn
 
+from ...lanes.row_numbers import over_some_rows
 from ...numerics.exponential_step import GRACE, MOST, TOLERANCE, TRIED, StepsNeeded, needed_steps
 from ..problem.held_plant import Holding
 
@@ -39,15 +40,17 @@ def needed(holding: Holding, x: Tensor, u: Tensor, frozen: Tensor, most: int = M
     def errors(rows: Tensor, times: int) -> Tensor:
         finer = holding if times == 1 else holding.finer(times)
         some = rows.split(max(1, _TOGETHER // x.shape[1]))
-        return torch.cat([_errors(finer, x[part], u[part].nan_to_num(0.0), known[part]) for part in some])
+        return torch.cat(
+            [_errors(finer, part, x[part], u[part].nan_to_num(0.0), known[part]) for part in some]
+        )
 
     return needed_steps(errors, limit, TOLERANCE, GRACE * TOLERANCE)
 
 
-def _errors(holding: Holding, x: Tensor, u: Tensor, known: Tensor) -> Tensor:
+def _errors(holding: Holding, rows: Tensor, x: Tensor, u: Tensor, known: Tensor) -> Tensor:
     """Return the largest error of a row's holds, relative to its largest state and cost: (R,)."""
-    worst = torch.zeros(len(x), dtype=torch.float64, device=x.device)
-    for wrong, size in holding.doubled(x.flatten(0, 1), u.flatten(0, 1)):
+    worst = torch.zeros(len(x), dtype=torch.float64, device="cpu")
+    for wrong, size in over_some_rows(holding.doubled, rows, x, u):
         off, large = (torch.where(known, part.view(known.shape), 0.0) for part in (wrong, size))
         large = torch.where(torch.isfinite(large), large, 0.0).amax(1)
         worst = torch.maximum(worst, (off.amax(1) / large).nan_to_num(math.inf, math.inf).double().cpu())
@@ -71,9 +74,9 @@ def hardest(
         (R, K, n), (R, K, m).
     """
     held = torch.isfinite(control[:, :-1]).all(-1)
-    rows, inputs = state[:, :-1].flatten(0, 1), control[:, :-1].flatten(0, 1).nan_to_num(0.0)
-    pieces = zip(rows.split(_TOGETHER), inputs.split(_TOGETHER), strict=True)
-    bent = torch.cat([holding.watched(x, u)[2] for x, u in pieces]).view(held.shape)
+    some = torch.arange(len(state)).split(max(1, _TOGETHER // held.shape[1]))
+    moves = state[:, :-1], control[:, :-1].nan_to_num(0.0)
+    bent = torch.cat([over_some_rows(holding.watched, part, *(m[part] for m in moves))[2] for part in some])
     bent = torch.where(held, bent.nan_to_num(math.inf, math.inf), -1.0)
     bent[:, 0] = math.inf
     at = bent.topk(min(TRIED, bent.shape[1]), dim=1).indices.unsqueeze(-1)

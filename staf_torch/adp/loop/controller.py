@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable, Mapping
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
@@ -12,6 +12,8 @@ from torch.nn.functional import pad
 
 from ...lanes.contents import is_users, version
 from ...lanes.gradients import gradients_of, marked
+from ...lanes.row_numbers import over_rows
+from ...lanes.row_objects import OfRows
 from ...numerics.checks import copied, real, trailing
 from ...numerics.default_device import beside
 from ...numerics.linalg import riccati
@@ -32,7 +34,7 @@ Carried = Any
 such; () where it carries nothing."""
 
 
-class Controller(nn.Module, abc.ABC):
+class Controller(nn.Module, metaclass=OfRows):
     """u and what the controller carries on, from the state and what it carried until then.
 
     Example:
@@ -164,7 +166,7 @@ class Feedback(Controller):
             return
         before = _tensors_of(self.policy)
         with torch.no_grad():
-            self.policy(x0)
+            over_rows(self.policy, x0)
         for name, (tensor, written) in _tensors_of(self.policy).items():
             if name not in before or tensor is not before[name][0] or written != before[name][1]:
                 raise ValueError(
@@ -182,7 +184,7 @@ def _tensors_of(policy: Any) -> dict[str, tuple[Tensor, int]]:
     return {name: (x, version(x)) for name, x in held.items() if isinstance(x, Tensor)}
 
 
-class LQR(nn.Module):
+class LQR(nn.Module, metaclass=OfRows):
     """u = u_s - K (x - x_s) with K = R^-1 B'P and P from the Riccati equation of the linearisation at the
     set-point x_s of the cost, where u_s holds the plant; angles are differences in [-pi, pi]. Of a
     `TrackingCost` P and K are those of the plant's equilibrium, and x_s moves along the path.
@@ -217,6 +219,8 @@ class LQR(nn.Module):
             linearisation cannot be stabilised, or the cost does not see a mode that does not decay; if either
             holds a tensor that requires a gradient, other than a network's.
     """
+
+    rowwise: ClassVar = {"forward": (1,), "value": (1,)}
 
     @beside
     def __init__(self, system: Plant, cost: Cost, period: float | None = None) -> None:

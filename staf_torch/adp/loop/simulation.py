@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import logging
@@ -18,6 +19,7 @@ from ...lanes.compiled_methods import undecided, worth
 from ...lanes.gradients import without_gradient
 from ...lanes.loop_program import LoopProgram
 from ...lanes.opaque import opaque
+from ...lanes.row_numbers import each_row, over_rows, some_rows
 from ...lanes.tree import flatten, unflatten
 from ...numerics.angles import wrap
 from ...numerics.checks import choice, copied, fail, integer, positive_real, trailing
@@ -39,6 +41,7 @@ from .step import ClosedLoop, LoopState, program, record, row_numbers
 _log = logging.getLogger(__name__)
 _DRAWN_AHEAD = 1024  # steps whose random numbers are drawn at once
 _NUMBERS = 1 << 24  # at most, of all rows together
+_ROWS = 16  # with numbers of their own, that are looked at
 _SEEN = 32  # times at which the size of a row's states is looked at
 _EULER = 64  # rows of the published integrator that are checked
 _DT = 0.001  # s, where neither controller nor plant has a period
@@ -329,11 +332,13 @@ class _LoopRun:
         ``again``; warn of those that are wrong by more than a little."""
         rest, at = loop.system.resting_input(), rows.nonzero().squeeze(1)
         frozen = result.diverged[at]
-        moves = hardest(loop.holding, result.state[at], result.control[at], rest, frozen)
-        found = needed(loop.holding, *moves, frozen)
+        with some_rows(at):
+            moves = hardest(loop.holding, result.state[at], result.control[at], rest, frozen)
+            found = needed(loop.holding, *moves, frozen)
         warn_of_models(loop.controller, *moves)
         if not again:
-            one = needed(loop.holding, *moves, torch.ones_like(frozen), most=1)
+            with some_rows(at):
+                one = needed(loop.holding, *moves, torch.ones_like(frozen), most=1)
             warn_of_errors(loop.holding, at, one, "Leave `substeps` and `integrator` as they are by default.")
             return result
         for factor in found.factor.unique().tolist():
@@ -352,7 +357,8 @@ class _LoopRun:
         some = dataclasses.replace(whole, x0=self.x0[rows], seeds=[self.seeds[row] for row in rows.tolist()])
         alone = not row_numbers(loop)
         try:
-            other, _ = (some if alone else whole).of(loop)
+            with some_rows(rows) if alone else contextlib.nullcontext():
+                other, _ = (some if alone else whole).of(loop)
             known = len(other.state) == (len(rows) if alone else len(self.x0))
         except (RuntimeError, ValueError):
             known = False
@@ -429,7 +435,7 @@ def _check(system: Plant, cost: Cost, x0: Tensor) -> Cost:
         raise fail("simulate", "cost", f"must be for the plant's {size} states", cost.dim)
     affine = isinstance(system, ControlAffineSystem)
     for method, shape in () if not affine else (("drift", x0.shape), ("effectiveness", (*x0.shape, inputs))):
-        returned = getattr(system, method)(x0)
+        returned = over_rows(getattr(system, method), x0)
         if not isinstance(returned, Tensor) or returned.shape != shape:
             got = tuple(returned.shape) if isinstance(returned, Tensor) else returned
             raise ValueError(
@@ -438,5 +444,5 @@ def _check(system: Plant, cost: Cost, x0: Tensor) -> Cost:
             )
     check_problem(system, cost)
     placed = cost.around(system)
-    warn_if_restless("simulate", system, placed)
+    each_row(lambda: warn_if_restless("simulate", system, placed), _ROWS)
     return placed

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable, Sequence
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
 
+from ...lanes.row_objects import OfRows, by_rows
 from ...numerics.angles import periods_of, turned, wrap, wrap_each
 from ...numerics.box import LARGEST, box_minimum, face_inverses
 from ...numerics.checks import (
@@ -40,7 +41,7 @@ Output = Callable[[Tensor], Tensor]
 """y from x: (..., n) -> (..., p)."""
 
 
-class Cost(nn.Module, abc.ABC):
+class Cost(nn.Module, metaclass=OfRows):
     """The cost rate e'Qe + U(u) of an infinite horizon, with U convex and 0 at the input that holds the plant
     at the set-point. e is the state measured from there, angles in [-pi, pi], or an output of it.
 
@@ -70,6 +71,13 @@ class Cost(nn.Module, abc.ABC):
         ValueError: if Q is not positive semidefinite or R not positive definite of its size, or another
             argument breaks its rule.
     """
+
+    rowwise: ClassVar = {
+        **dict.fromkeys(("state_rate", "outputs", "error", "terminal", "deviation"), (1,)),
+        **dict.fromkeys(("input_rate", "saturate", "admissible", "unsaturated", "effort", "input_of"), (1,)),
+        "rate": (1, 1),
+        "policy": (2, 1),
+    }
 
     @beside
     def __init__(
@@ -120,6 +128,7 @@ class Cost(nn.Module, abc.ABC):
         self.bounds: Bounds | None = bounds if bounds.present else None
         self._prepare()
 
+    @by_rows
     @beside
     def around(self, plant: Plant) -> Self:
         """This cost with a plant's equilibrium, periodic coordinates and bounds where it states none of its
@@ -435,7 +444,10 @@ def _pull(effectiveness: Tensor, gradient: Tensor) -> Tensor:
 def square(call: str, name: str, value: Matrix, size: int) -> Tensor:
     """A matrix given as itself, by its diagonal, or as a number times the identity: (size, size)."""
     if isinstance(value, Tensor):
-        return value.to(torch.float64) if value.dim() != 1 else value.to(torch.float64).diag()
+        given = value.to(torch.float64)
+        if given.dim() > 1:
+            return given
+        return given.diag() if given.dim() else given * torch.eye(size, dtype=torch.float64)
     if isinstance(value, Sequence) and not isinstance(value, str):
         if value and all(isinstance(entry, int | float) for entry in value):
             return torch.tensor(

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ...lanes import repeat, scan
 from ...lanes.loops import untraced
+from ...lanes.row_numbers import each_row, met_rows
 from ...numerics.checks import integer, positive_real
 from ...numerics.exponential_step import (
     GRACE,
@@ -37,6 +38,7 @@ _SAMPLES, _SHARE = 24, 0.8  # states; the share that one step must serve, as it 
 _MOVED = 0.1  # of the spread, in a hold, by inputs without bounds
 _DEARER = 1.5  # work of an exponential step, in classical ones
 _LEAST = 1e-6  # of a state, below which errors are absolute
+_ROWS = 8  # with numbers of their own, that are looked at
 _PAID = 0.1  # weight of the cost's error beside the state's
 Substeps = int | tuple[int, int] | None
 
@@ -109,7 +111,7 @@ class Holding:
             self.least = self.steps = periods(call, plant, dt)
         elif substeps is None:
             with untraced(), torch.no_grad():  # a filter may ask for it in its first step
-                self._choose(exponential)
+                self._choose_for_rows(exponential)
 
     @property
     def classical(self) -> bool:
@@ -259,6 +261,21 @@ class Holding:
 
     def _table(self, linear: Tensor, steps: int) -> ExponentialStep:
         return exponential_step(linear, self.dt / steps, self.curvature, self.discount)
+
+    def _choose_for_rows(self, exponential: bool) -> None:
+        """Choose by the rows that need most steps, where rows have numbers of their own: classical ones then,
+        as a table of exponential steps is made of one row's numbers. A row that needs more runs again."""
+
+        def chosen(exponential: bool) -> Holding:
+            other = copy.copy(self)
+            other._choose(exponential)
+            return other
+
+        with met_rows() as met:
+            found = each_row(lambda: chosen(exponential), 1)
+        if met:
+            found = each_row(lambda: chosen(False), _ROWS)
+        vars(self).update(vars(max(found, key=lambda each: each.steps)))
 
     def _choose(self, exponential: bool) -> None:
         """Choose the kind of the steps and their number."""

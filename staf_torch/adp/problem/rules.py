@@ -13,6 +13,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from ...lanes.row_numbers import each_row
 from ...numerics.checks import fail, positive_real
 from ...systems import Bounds, Clocked, Plant
 from ...systems.equilibria import check_rest
@@ -22,6 +23,7 @@ from .shapes import check_problem
 
 _log = logging.getLogger(__name__)
 _NEAR, _NOTHING = 1e-4, 1e-9  # of a state around the set-point, and of the cost rate there
+_ROWS = 16  # with numbers of their own, of which the loop is linearised
 _CONSTANTS = 0.5  # time constants of the slowest mode that a horizon must have
 
 
@@ -215,13 +217,19 @@ def warn_if_unstable(policy: Callable[[Tensor], Tensor], plant: Plant, cost: Cos
     Returns:
         The fastest mode of the linearised plant without control, 1/s; inf where it is not known.
     """
-    try:
+
+    def looked_at() -> tuple[HeldLoop, float, float]:
         held = HeldLoop.of(policy, plant, at=cost.set_point())
+        fastest = float(torch.linalg.eigvals(held.f).abs().max()) if held.finite else math.inf
+        return held, held.spectral_radius(dt), fastest
+
+    try:
+        loops = each_row(looked_at, _ROWS)
     except (RuntimeError, ValueError) as error:  # a loop runs where nobody can say whether it is stable
         _log.info("whether the linearised loop is stable was not looked at: %s", error)
         return math.inf
-    radius = held.spectral_radius(dt)
-    fastest = float(torch.linalg.eigvals(held.f).abs().max()) if held.finite else math.inf
+    fastest = max(loop[2] for loop in loops)
+    held, radius, _ = max(loops, key=lambda loop: loop[1])
     if not radius >= 1:
         return fastest
     most = held.largest_period()

@@ -8,6 +8,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from ...lanes.row_objects import by_rows
 from ...numerics.angles import wrap
 from ...numerics.checks import copied, fail
 from ...numerics.row_checks import check_rows
@@ -69,6 +70,7 @@ class TrackingCost(QuadraticCost):
         now = torch.zeros((), dtype=torch.float64, device="cpu")
         check_rows("TrackingCost(path=...)", path, [now], (dim,), sizes=(inputs,))
 
+    @by_rows
     def around(self, plant: Plant) -> Self:
         """This cost with the plant's bounds, periodic coordinates and resting input where it has none.
 

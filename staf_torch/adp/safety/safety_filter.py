@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -128,6 +128,13 @@ class SafetyFilter(Controller):
     Sreenath, "Exponential control barrier functions", ACC (2016), for degree two; Gurriet et al., IEEE Access
     (2020), for what a backup law keeps.
     """
+
+    rowwise: ClassVar = {
+        "forward": (1, 0),
+        "restrain": (1, 1, 0),
+        "margins": (1, 0),
+        "inequalities": (1, 1, 0),
+    }
 
     @beside
     def __init__(

@@ -19,6 +19,7 @@ from torch.overrides import TorchFunctionMode
 from ..call import Given
 from ..emit.schedule import Sizes
 from ..loops import tracing
+from ..row_numbers import RowNumbers, resolving
 from ..tree import Shared, Tree, flatten, plain
 from . import eigenvalues, factorisations
 from . import reductions as reductions  # its rules
@@ -75,6 +76,7 @@ class Traced(NamedTuple):
     outputs: tuple[tuple[torch.Size, torch.dtype], ...]
     structure: Any
     recipe: Recipe
+    rows: tuple[RowNumbers, ...]  # whose columns follow what a row has once
 
 
 def trace(step: Step, given: Given, *, widened: bool = False, folded: bool = False) -> Traced:
@@ -106,7 +108,17 @@ def trace(step: Step, given: Given, *, widened: bool = False, folded: bool = Fal
         row = given.tree("row", inputs("row", given.row, 0, 0))
         now = given.tree("now", inputs("now", given.now, NOW, 1))
         carry = inputs("state", given.carry, STEP, 0)
-        with tracer, tracing(tracer), _TorchFunctions(tracer.traced):
+        own: dict[int, tuple[RowNumbers, Tensor]] = {}
+
+        def one(numbers: RowNumbers) -> Tensor:
+            if folded:
+                raise NotLoweredError("it reads numbers of a row's own, of which this form has no column")
+            if id(numbers) not in own:
+                slot, like = len(given.row) + len(own), numbers.full[:1]
+                own[id(numbers)] = numbers, tracer.input(like, "row", slot)[0]
+            return own[id(numbers)][1]
+
+        with tracer, tracing(tracer), resolving(one), _TorchFunctions(tracer.traced):
             try:
                 after, out = step(given.tree("carry", carry), now, row)
             except NotLoweredError:
@@ -126,13 +138,14 @@ def trace(step: Step, given: Given, *, widened: bool = False, folded: bool = Fal
         following = [node for end in ends for node in tracer.nodes(end).ravel().tolist()]
         outputs = [node for leaf in leaves for node in tracer.nodes(leaf).ravel().tolist()]
         layout = Sizes(
-            [_entries(leaf, 1) for leaf in given.row],
+            [_entries(leaf, 1) for leaf in given.row] + [numbers.numel() for numbers, _ in own.values()],
             [_entries(leaf, 2) for leaf in given.now],
             [_entries(leaf, 1) for leaf in given.carry],
             [leaf.numel() for leaf in leaves],
         )
     shapes = tuple((leaf.shape[1:], leaf.dtype) for leaf in leaves)
-    return Traced((graph, layout, following, outputs), shapes, shape, tracer.captured.recipe())
+    rows = tuple(numbers for numbers, _ in own.values())
+    return Traced((graph, layout, following, outputs), shapes, shape, tracer.captured.recipe(), rows)
 
 
 def _other_carry(who: str, found: Sequence[Tensor], given: Sequence[Tensor]) -> str:

@@ -1,0 +1,421 @@
+"""Numbers of a row's own: a mass, a width, a gain that differs from row to row of a batch.
+
+A tensor (B, ...) that `rows` has marked looks, to every function, like the number of one row, (...): code is
+written for one plant and means B of them. What a function computes with it is `torch.func.vmap` over the rows.
+Three readers give it a value. A program that is traced asks for one row's number and gets an input of its own,
+a column (B, ...) of every call. Plain torch of an engine (`over_rows`) runs under one `vmap` over the numbers
+and the rows of its inputs. Elsewhere, as in the constructor of a module, every operation is a `vmap` by itself
+and returns numbers of rows again. To find the numbers by reading objects would miss what a function looks up;
+they announce themselves.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+from torch.utils._pytree import tree_flatten, tree_map, tree_unflatten
+
+from .tree import Shared, Tree, flatten, unflatten
+
+Some = TypeVar("Some")
+Resolve = Callable[["RowNumbers"], Tensor]
+_active = threading.local()
+_STRUCTURE = frozenset(
+    [
+        "dim",
+        "ndimension",
+        "size",
+        "numel",
+        "nelement",
+        "is_floating_point",
+        "is_complex",
+        "is_signed",
+        "stride",
+        "element_size",
+        "__len__",
+        "is_contiguous",
+        "storage_offset",
+        "get_device",
+        "type",
+        "is_pinned",
+        "is_inference",
+        "is_conj",
+        "is_neg",
+    ]
+)
+"""Methods that answer alike for all rows."""
+_ATTRIBUTES = frozenset(
+    [
+        "shape",
+        "dtype",
+        "device",
+        "layout",
+        "ndim",
+        "itemsize",
+        "nbytes",
+        "is_cpu",
+        "is_cuda",
+        "is_meta",
+        "is_sparse",
+        "is_quantized",
+        "is_nested",
+        "is_mkldnn",
+        "is_mps",
+        "is_xpu",
+        "names",
+        "_version",
+    ]
+)
+_OF_ALL = frozenset(["requires_grad", "grad", "grad_fn", "is_leaf", "retains_grad", "output_nr"])
+"""Attributes of the numbers of all rows together."""
+_READS = frozenset(
+    [
+        "__bool__",
+        "__float__",
+        "__int__",
+        "__index__",
+        "__complex__",
+        "__contains__",
+        "item",
+        "tolist",
+        "numpy",
+        "__array__",
+        "equal",
+        "allclose",
+        "is_nonzero",
+        "data_ptr",
+    ]
+)
+
+_ENTRYWISE = frozenset(f"aten::{name}" for name in ("_to_copy", "detach", "clone", "alias", "lift_fresh"))
+
+
+class RowsMetError(BaseException):  # no handler of errors in a user's code is meant
+    """The signal that a function read numbers of rows where nobody had said whose.
+
+    Args:
+        numbers: that were read.
+    """
+
+    def __init__(self, numbers: RowNumbers) -> None:
+        super().__init__()
+        self.numbers = numbers
+
+
+class RowNumbers(Tensor):
+    """A tensor of which every row of a batch has its own entry; `rows` makes it.
+
+    Attributes:
+        full: (B, ...), the numbers of all rows.
+    """
+
+    full: Tensor
+    made = False  # whether a process has any
+
+    @staticmethod
+    def __new__(cls, full: Tensor) -> RowNumbers:
+        RowNumbers.made = True
+        one = full.detach()[0]
+        numbers: RowNumbers = Tensor._make_wrapper_subclass(  # type: ignore[attr-defined]
+            cls, one.shape, strides=one.stride(), dtype=full.dtype, device=full.device, requires_grad=False
+        )
+        numbers.full = full
+        return numbers
+
+    @classmethod
+    def __torch_function__(
+        cls, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        kwargs = kwargs or {}
+        resolve: Resolve | None = getattr(_active, "resolve", None)
+        if resolve is None or (resolve is _refuse and _asks_structure(func)):
+            return _operation(func, args, kwargs)
+        args, kwargs = tree_map(lambda x: resolve(x) if isinstance(x, RowNumbers) else x, (args, kwargs))
+        return func(*args, **kwargs)
+
+    @classmethod
+    def __torch_dispatch__(
+        cls, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        return _below(func, args, kwargs or {})
+
+    def __repr__(self, **_: Any) -> str:
+        return f"rows({self.full!r})"
+
+    def __format__(self, form: str) -> str:
+        return repr(self)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> RowNumbers:
+        return memo.setdefault(id(self), RowNumbers(copy.deepcopy(self.full, memo)))
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        return RowNumbers, (self.full,)
+
+
+def _tried() -> bool:
+    return getattr(_active, "resolve", None) is _refuse
+
+
+def in_use() -> bool:
+    """Return whether numbers of rows may be met where nobody has said whose."""
+    return RowNumbers.made and getattr(_active, "resolve", None) is None
+
+
+def all_rows(tensor: Tensor) -> Tensor:
+    """Return the memory of a tensor: (B, ...) of numbers of rows, itself of others."""
+    return tensor.full if isinstance(tensor, RowNumbers) else tensor
+
+
+@contextmanager
+def resolving(resolve: Resolve) -> Iterator[None]:
+    """Numbers of rows have, within the block and on this thread, the value that ``resolve`` gives them."""
+    before, _active.resolve = getattr(_active, "resolve", None), resolve
+    try:
+        yield
+    finally:
+        _active.resolve = before
+
+
+@contextmanager
+def of_all_rows() -> Iterator[None]:
+    """What is computed from numbers of rows in the block is numbers of rows, for a decision that all share."""
+    before, _active.resolve = getattr(_active, "resolve", None), None
+    try:
+        yield
+    finally:
+        _active.resolve = before
+
+
+@contextmanager
+def some_rows(chosen: Tensor) -> Iterator[None]:
+    """Batches of the block hold these rows (R,) of those that numbers were given for, in this order."""
+    before = getattr(_active, "chosen", None)
+    _active.chosen = chosen if before is None else before[chosen.to(before.device)]
+    try:
+        yield
+    finally:
+        _active.chosen = before
+
+
+@contextmanager
+def points_of_rows(count: int, points: int) -> Iterator[None]:
+    """Batches of the block hold so many points of each of ``count`` rows, row after row."""
+    if not RowNumbers.made:
+        yield
+        return
+    with some_rows(torch.arange(count).repeat_interleave(points)):
+        yield
+
+
+def columns(numbers: Sequence[RowNumbers], count: int | None) -> list[Tensor]:
+    """Return the numbers (B, ...) of the rows of a batch, of ``count`` rows where it is stated.
+
+    Raises:
+        ValueError: if the batch has another number of rows.
+    """
+    chosen = getattr(_active, "chosen", None)
+    found = [each.full if chosen is None else each.full[chosen] for each in numbers]
+    for each, column in zip(numbers, found, strict=True):
+        if count is not None and len(column) != count:
+            if _tried():  # somebody outside knows better whose the numbers are
+                raise RowsMetError(each)
+            raise _other_count(column, count)
+    return found
+
+
+def over_rows(function: Callable[..., Some], *given: Tree) -> Some:
+    """function(*given), trees (B, ...) to (B, ...), where the function may read numbers of a row's own.
+
+    It runs once with all rows where it meets none. Else it runs under `torch.func.vmap`, each row with its own
+    numbers and a batch of one; row by row where it decides by values.
+
+    Args:
+        function: of which no row sees another.
+        given: trees of tensors (B, ...), and `Shared` ones.
+    """
+    if getattr(_active, "resolve", None) is not None and not _tried():  # somebody outside has said whose
+        return function(*given)
+    try:
+        with resolving(_refuse):
+            return function(*given)
+    except RowsMetError as met:
+        numbers = met.numbers
+    return _mapped(function, given, numbers)
+
+
+def each_row(function: Callable[[], Some], most: int | None = None, *, named: bool = False) -> list[Some]:
+    """function() of every row, which sees its own numbers alone; once where it reads no numbers of rows.
+
+    For what decides by values, as a design does.
+
+    Args:
+        function: of no arguments.
+        most: rows, spread over all of them; all by default.
+        named: whether an error says of which row it is.
+    """
+    if getattr(_active, "resolve", None) is not None:
+        return [function()]
+    try:
+        with resolving(_refuse):
+            return [function()]
+    except RowsMetError as error:
+        count = len(columns([error.numbers], None)[0])
+    for met in getattr(_active, "met", ()):
+        met.append(count)
+    few = count if most is None else min(count, most)
+    rows = torch.linspace(0, count - 1, few, dtype=torch.float64).round().long().tolist()
+    found = []
+    for row in rows:
+        try:
+            found.append(in_row(row, function))
+        except ValueError as error:
+            if not named:
+                raise
+            raise ValueError(f"{error} (in row {row})") from error
+    return found
+
+
+@contextmanager
+def met_rows() -> Iterator[list[int]]:
+    """Yield a list that is not empty once `each_row` has met numbers of rows in the block."""
+    met = list[int]()
+    before, _active.met = getattr(_active, "met", ()), [*getattr(_active, "met", ()), met]
+    try:
+        yield met
+    finally:
+        _active.met = before
+
+
+def in_row(row: int, function: Callable[[], Some]) -> Some:
+    """function() with the numbers of one row."""
+    with resolving(lambda numbers: columns([numbers], None)[0][row]):
+        return function()
+
+
+def over_some_rows(function: Callable[..., Some], chosen: Tensor, *given: Tree) -> Some:
+    """function(*given) as of `over_rows`, with the numbers of these rows (R,) of all, of which ``given`` is."""
+    with some_rows(chosen):
+        return over_rows(function, *given)
+
+
+def refused() -> contextlib.AbstractContextManager[None]:
+    """Return the context in which to read numbers of rows raises `RowsMetError`."""
+    return resolving(_refuse)
+
+
+def _refuse(numbers: RowNumbers) -> Tensor:
+    raise RowsMetError(numbers)
+
+
+def _mapped(function: Callable[..., Some], given: tuple[Tree, ...], met: RowNumbers) -> Some:
+    leaves, structure = flatten(given)
+    own = [leaf for leaf in leaves if not isinstance(leaf, Shared)]
+    count = len(own[0]) if own else len(columns([met], None)[0])
+    columns([met], count)
+    indices, shape = torch.arange(count, device=met.device), None
+
+    def one(index: Tensor, *parts: Tensor) -> tuple[Tensor, ...]:
+        nonlocal shape
+        rest = iter(parts)
+        alone = [leaf if isinstance(leaf, Shared) else next(rest).unsqueeze(0) for leaf in leaves]
+        known: dict[int, Tensor] = {}
+
+        def resolve(numbers: RowNumbers) -> Tensor:
+            if id(numbers) not in known:
+                known[id(numbers)] = columns([numbers], count)[0][index]
+            return known[id(numbers)]
+
+        with resolving(resolve):
+            ends, shape = flatten(function(*unflatten(structure, iter(alone))))
+        return tuple(end.squeeze(0) for end in ends)
+
+    try:
+        found = torch.func.vmap(one, randomness="different")(indices, *own)
+    except RuntimeError as error:
+        if not _decides(error):
+            raise
+        each = [one(index, *(leaf[int(index)] for leaf in own)) for index in indices]
+        found = tuple(torch.stack(column) for column in zip(*each, strict=True))
+    some: Some = unflatten(shape, iter(found))
+    return some
+
+
+def _decides(error: RuntimeError) -> bool:
+    """Return whether a function read a value under `vmap`, which its rows alone may do."""
+    text = str(error)
+    return "vmap" in text and ("data-dependent" in text or ".item()" in text or "dynamic shape" in text)
+
+
+def _operation(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    """One operation of numbers of rows outside of a batch: numbers of rows, too."""
+    name, leaves, spec = getattr(func, "__name__", ""), *tree_flatten((args, kwargs))
+    at = [k for k, leaf in enumerate(leaves) if isinstance(leaf, RowNumbers)]
+    full = [leaves[k].full for k in at]
+    if name in ("__get__", "__set__"):
+        attribute = func.__self__.__name__
+        if attribute == "data":
+            return RowNumbers(full[0].data) if name == "__get__" else setattr(args[0], "full", full[-1])
+        if attribute in _OF_ALL or name == "__set__":
+            return func(full[0], *args[1:])
+        if attribute in _ATTRIBUTES:
+            return func(full[0].detach()[0])
+    if name == "_has_compatible_shallow_copy_type":  # a module makes a new parameter then
+        return False
+    if name in _STRUCTURE:
+        return func(full[0].detach()[0], *args[1:], **kwargs)
+    if name in _READS:
+        raise ValueError(
+            f"`Tensor.{name}` of `rows(...)`: a number that differs from row to row has no single value; "
+            "compute with it in torch, or read `.full`, (B, ...)."
+        )
+    if name == "requires_grad_":
+        full[0].requires_grad_(*args[1:], **kwargs)
+        return leaves[at[0]]
+    counts = {len(column) for column in full}
+    if len(counts) > 1:
+        raise ValueError(f"`rows(...)` of {' and '.join(map(str, sorted(counts)))} rows meet in `{name}`.")
+
+    def one(*parts: Tensor) -> Any:
+        inside = list(leaves)
+        for k, part in zip(at, parts, strict=True):
+            inside[k] = part
+        positional, named = tree_unflatten(inside, spec)
+        return func(*positional, **named)
+
+    found = torch.func.vmap(one, randomness="different")(*full)
+    return tree_map(lambda x: RowNumbers(x) if isinstance(x, Tensor) else x, found)
+
+
+def _asks_structure(func: Any) -> bool:
+    """Return whether a function of torch answers alike for all rows."""
+    name = getattr(func, "__name__", "")
+    return name in _STRUCTURE or (name == "__get__" and func.__self__.__name__ in _ATTRIBUTES | _OF_ALL)
+
+
+def _below(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    """One operation that no Python function of torch has seen (`torch.as_tensor`), where `vmap` has no say."""
+    if func._schema.name in _ENTRYWISE:
+        return RowNumbers(func(args[0].full, *args[1:], **kwargs))
+    leaves, spec = tree_flatten((args, kwargs))
+    count = next(len(leaf.full) for leaf in leaves if isinstance(leaf, RowNumbers))
+    each = []
+    for k in range(count):
+        inside = [leaf.full[k] if isinstance(leaf, RowNumbers) else leaf for leaf in leaves]
+        positional, named = tree_unflatten(inside, spec)
+        each.append(func(*positional, **named))
+    if isinstance(each[0], Tensor):
+        return RowNumbers(torch.stack(each))
+    return each[0]
+
+
+def _other_count(column: Tensor, count: int) -> ValueError:
+    return ValueError(
+        f"a batch of {count} rows met numbers that `rows(...)` holds for {len(column)}: both must be one number."
+    )

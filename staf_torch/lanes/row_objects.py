@@ -1,0 +1,285 @@
+"""Objects whose numbers differ from row to row: made row by row, and merged into one.
+
+A constructor decides by values (it solves a Riccati equation, refuses what is not positive), which numbers of
+many rows at once do not allow. It runs once for every row, with that row's numbers alone. The objects that
+come out are of one structure, and where they differ they differ in numbers: tensors and floats become
+`RowNumbers`, everywhere else they must be equal.
+"""
+
+from __future__ import annotations
+
+import abc
+import functools
+import inspect
+from collections.abc import Callable, Sequence
+from types import CellType, FunctionType, MethodType
+from typing import Any, ParamSpec, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from .contents import BOUND, Derived
+from .row_numbers import RowNumbers, RowsMetError, each_row, in_use, met_rows, over_rows, refused
+from .tree import Shared, plain
+
+Some = TypeVar("Some")
+Given = ParamSpec("Given")
+
+
+def rows(numbers: Tensor | Sequence[nn.Module]) -> Any:
+    """Mark numbers of which every row of a batch has its own: the first dimension is the rows.
+
+    Wherever a number may stand, such a tensor may stand: in a plant, a cost, a kernel, a law, in a module or a
+    function of your own, which sees the number of one row, without the dimension of rows. Its meaning is
+    `torch.func.vmap` over the rows; compiled, a row's numbers are columns of a program.
+
+    Example:
+        >>> masses = torch.linspace(0.5, 2.0, 4).double()
+        >>> plant = systems.Pendulum(mass=staf_torch.rows(masses))
+        >>> x0 = torch.tensor([[1.0, 0.0]]).double().expand(4, 2)
+        >>> systems.simulate(plant, x0, dt=0.01, steps=100).shape  # four pendulums
+        torch.Size([4, 101, 2])
+
+        Shown by `staf_torch/lanes/README.md`.
+
+    Args:
+        numbers: (B, ...), floating-point; or B modules of one class, which differ in numbers: the module that
+            has the numbers of all, as `torch.func.stack_module_state` stacks them.
+
+    Raises:
+        ValueError: if there is no row, numbers are no floating-point numbers, or modules differ in more than
+            numbers.
+    """
+    if isinstance(numbers, RowNumbers):
+        return numbers
+    if isinstance(numbers, Tensor):
+        if not numbers.is_floating_point():
+            raise ValueError(f"`rows(numbers=...)` must be floating-point numbers; got {numbers.dtype}.")
+        if numbers.dim() == 0 or not len(numbers):
+            raise ValueError(
+                f"`rows(numbers=...)` must have a first dimension of rows, one at least; "
+                f"got the shape {tuple(numbers.shape)}."
+            )
+        return RowNumbers(numbers)
+    modules = list(numbers)
+    if not modules or any(type(each) is not type(modules[0]) for each in modules):
+        kinds = ", ".join(sorted({type(each).__name__ for each in modules}))
+        raise ValueError(f"`rows(numbers=...)` must be modules of one class; got {kinds or 'none'}.")
+    return merged(modules)
+
+
+def by_rows(function: Callable[Given, Some]) -> Callable[Given, Some]:
+    """Decorator of a function that decides by values: with numbers of rows it runs for every row by itself.
+
+    Its results are merged: tensors and floats that differ become `RowNumbers`.
+    """
+
+    @functools.wraps(function)
+    def either(*args: Given.args, **kwargs: Given.kwargs) -> Some:
+        return made_by_rows(lambda: function(*args, **kwargs))
+
+    return either
+
+
+def made_by_rows(make: Callable[[], Some]) -> Some:
+    """Return what ``make`` returns; where it reads numbers of rows, that of all rows, merged."""
+    with met_rows() as met:
+        found = each_row(make, named=True)
+    return merged(found) if met else found[0]
+
+
+class Rowwise(abc.ABCMeta):
+    """Metaclass of modules whose methods are functions of points.
+
+    A class says in ``rowwise`` which of its methods, and of those of its subclasses, are functions of points:
+    by the name, how many dimensions each argument has without rows. Called with numbers of rows by somebody who
+    has not said whose, such a method takes its arguments (B, ...) row by row; one without rows is for all.
+    """
+
+    def __new__(mcs, name: str, bases: tuple[type, ...], space: dict[str, Any], **more: Any) -> Any:
+        known = [space.get("rowwise", {}), *(getattr(base, "rowwise", {}) for base in bases)]
+        rowwise = {key: dims for each in reversed(known) for key, dims in each.items()}
+        for key, dims in rowwise.items():
+            if isinstance(space.get(key), FunctionType):
+                space[key] = _of_points(space[key], dims)
+        return super().__new__(mcs, name, bases, {**space, "rowwise": rowwise}, **more)
+
+
+class OfRows(Rowwise):
+    """Metaclass of modules whose constructors decide by values: with numbers of rows they are made row by row."""
+
+    @property
+    def __signature__(cls) -> inspect.Signature:
+        """That of the constructor, for Hydra and editors, not that of `__call__` below."""
+        whole = inspect.signature(cls.__init__)  # type: ignore[misc]
+        return whole.replace(parameters=list(whole.parameters.values())[1:])
+
+    def __call__(cls: type[Some], *args: Any, **kwargs: Any) -> Some:
+        make: Callable[..., Some] = super().__call__  # type: ignore[misc]
+        own = [value for value in (*args, *kwargs.values()) if isinstance(value, RowNumbers)]
+        if not own or not in_use():
+            return made_by_rows(lambda: make(*args, **kwargs))
+        try:
+            with refused():
+                return make(*args, **kwargs)
+        except (RowsMetError, ValueError, TypeError):  # it reads them, or takes no tensors
+            pass
+
+        def one() -> Some:
+            return make(*map(_alone, args), **{name: _alone(value) for name, value in kwargs.items()})
+
+        return made_by_rows(one)
+
+
+def _of_points(method: Any, dims: Sequence[int]) -> Any:
+    """Return a method that takes points (B, ...) row by row where it reads numbers of rows."""
+
+    @functools.wraps(method)
+    def of_points(self: Any, *args: Any, **kwargs: Any) -> Any:
+        if not in_use() or kwargs:
+            return method(self, *args, **kwargs)
+        given = [_with_rows(arg, size) for arg, size in zip(args, dims, strict=False)]
+        rest = args[len(given) :]
+
+        def at(*points: Any) -> Any:
+            return method(self, *(plain(p) if isinstance(p, Shared | Tensor) else p for p in points), *rest)
+
+        return over_rows(at, *given)
+
+    return of_points
+
+
+def _alone(value: Any) -> Any:
+    """Return the number of the row whose turn it is: a float, or a tensor of more."""
+    if not isinstance(value, RowNumbers):
+        return value
+    tensor = value + 0.0
+    return tensor.item() if tensor.dim() == 0 else tensor
+
+
+def _with_rows(value: Any, size: int) -> Any:
+    return Shared(value) if isinstance(value, Tensor) and value.dim() <= size else value
+
+
+def merged(objects: Sequence[Some]) -> Some:
+    """Return the object that has the numbers of all rows.
+
+    Args:
+        objects: one a row, of one class and structure.
+
+    Raises:
+        ValueError: if they differ in more than numbers.
+    """
+    made: Some = _Merge().of(list(objects), type(objects[0]).__name__)
+    return made
+
+
+class _Merge:
+    def __init__(self) -> None:
+        self._made: dict[tuple[int, ...], Any] = {}
+        self._kept: list[Any] = []  # addresses are used once
+
+    def of(self, values: list[Any], name: str) -> Any:
+        first = values[0]
+        if all(value is first for value in values):
+            return first
+        kind = type(first)
+        if isinstance(first, Tensor):
+            return self._tensor(values, name)
+        if any(type(value) is not kind for value in values):
+            raise self._differ(values, name)
+        if kind is float:
+            if all(value == first or (value != value and first != first) for value in values):
+                return first
+            return RowNumbers(torch.tensor(values, dtype=torch.float64))
+        key = tuple(map(id, values))
+        if key not in self._made:
+            self._kept.append(values)
+            self._made[key] = self._new(values, kind, name, key)
+        return self._made[key]
+
+    def _tensor(self, values: list[Any], name: str) -> Any:
+        first = values[0]
+        alike = all(
+            isinstance(v, Tensor) and v.shape == first.shape and v.dtype == first.dtype for v in values
+        )
+        if not alike:
+            raise self._differ([tuple(v.shape) if isinstance(v, Tensor) else v for v in values], name)
+        if all(not isinstance(v, RowNumbers) and torch.equal(v, first) for v in values):
+            return first
+        if not first.is_floating_point():
+            raise self._differ(values, name)
+        made = RowNumbers(torch.stack([value.detach() for value in values]))
+        return nn.Parameter(made, first.requires_grad) if isinstance(first, nn.Parameter) else made
+
+    def _new(self, values: list[Any], kind: type, name: str, key: tuple[int, ...]) -> Any:
+        first = values[0]
+        if isinstance(first, list | tuple):
+            if any(len(value) != len(first) for value in values):
+                raise self._differ(values, name)
+            parts = [
+                self.of(list(column), f"{name}[{k}]") for k, column in enumerate(zip(*values, strict=True))
+            ]
+            return kind(*parts) if hasattr(first, "_fields") else kind(parts)
+        if isinstance(first, dict):
+            return kind(self._dict(values, name))
+        if isinstance(first, FunctionType):
+            return self._function(values, name)
+        if isinstance(first, MethodType):
+            return MethodType(first.__func__, self.of([value.__self__ for value in values], name))
+        if isinstance(first, functools.partial):
+            parts = [(value.func, value.args, value.keywords) for value in values]
+            function, args, keywords = self.of(parts, name)
+            return functools.partial(function, *args, **keywords)
+        if isinstance(first, Derived):
+            return kind(**self._dict([value.__getstate__() for value in values], name))
+        if hasattr(first, "__dict__") and not isinstance(first, type):
+            made = kind.__new__(kind)
+            self._made[key] = made
+            vars(made).update(self._dict([vars(value) for value in values], name))
+            return made
+        if all(value == first for value in values):
+            return first
+        raise self._differ(values, name)
+
+    def _dict(self, values: list[dict[Any, Any]], name: str) -> dict[Any, Any]:
+        keys = [key for key in values[0] if key != BOUND]
+        if any([key for key in value if key != BOUND] != keys for value in values):
+            raise self._differ([list(value) for value in values], name)
+        inside = {"_parameters", "_buffers", "_modules"}
+        return {
+            key: self.of([value[key] for value in values], name if key in inside else f"{name}.{key}")
+            for key in keys
+        }
+
+    def _function(self, values: list[Any], name: str) -> Any:
+        first = values[0]
+        if any(value.__code__ is not first.__code__ for value in values):
+            raise self._differ(values, name)
+        parts = [
+            (
+                [cell.cell_contents for cell in value.__closure__ or ()],
+                value.__defaults__,
+                value.__kwdefaults__,
+            )
+            for value in values
+        ]
+        closed, defaults, keywords = self.of(parts, name)
+        cells = tuple(CellType(content) for content in closed) or None
+        made = FunctionType(first.__code__, first.__globals__, first.__name__, defaults, cells)
+        made.__kwdefaults__ = keywords
+        return made
+
+    def _differ(self, values: list[Any], name: str) -> ValueError:
+        other = next(k for k, value in enumerate(values) if not _equal(value, values[0]))
+        return ValueError(
+            f"rows differ in `{name}`, which is no number: {values[0]!r} in row 0 and {values[other]!r} in row "
+            f"{other}; what is no number must be the same in all rows."
+        )
+
+
+def _equal(one: Any, other: Any) -> bool:
+    try:
+        return type(one) is type(other) and bool(one == other)
+    except (RuntimeError, ValueError):
+        return False
