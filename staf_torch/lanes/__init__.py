@@ -11,8 +11,9 @@ from .loops import scan as scan
 from .loops import traced_as as traced_as
 from .loops import where_rows as where_rows
 from .program import Program as Program
+from .row_objects import rows as rows
 from .shared_programs import shared_program as shared_program
 from .tree import Shared as Shared
 
 __all__ = ["Program", "Shared", "compiled", "compiling", "each", "ready", "reduce", "repeat", "scan"]
-__all__ += ["shared_program", "traced_as", "where_rows"]
+__all__ += ["rows", "shared_program", "traced_as", "where_rows"]

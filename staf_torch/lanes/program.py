@@ -314,8 +314,9 @@ class Program(Derived):
         if built is None or numbers is None:
             return None
         table = built.trace.text.numbers(numbers, built.compiled.real)
-        rows = tuple(others.get(id(each), each) for each in built.trace.rows)
-        if not all(isinstance(each, RowNumbers) for each in rows):
+        given = [others.get(id(each), each) for each in built.trace.rows]
+        rows = tuple(each for each in given if isinstance(each, RowNumbers))
+        if len(rows) < len(given):
             return None
         compiled = built.compiled._replace(table=table, rows=rows)
         return built._replace(compiled=compiled)

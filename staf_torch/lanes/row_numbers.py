@@ -1,12 +1,12 @@
 """Numbers of a row's own: a mass, a width, a gain that differs from row to row of a batch.
 
 A tensor (B, ...) that `rows` has marked looks, to every function, like the number of one row, (...): code is
-written for one plant and means B of them. What a function computes with it is `torch.func.vmap` over the rows.
-Three readers give it a value. A program that is traced asks for one row's number and gets an input of its own,
-a column (B, ...) of every call. Plain torch of an engine (`over_rows`) runs under one `vmap` over the numbers
-and the rows of its inputs. Elsewhere, as in the constructor of a module, every operation is a `vmap` by itself
-and returns numbers of rows again. To find the numbers by reading objects would miss what a function looks up;
-they announce themselves.
+written for one plant and means B of them. What a function computes with it is `torch.func.vmap` over the
+rows. Three readers give it a value. A program that is traced asks for one row's number and gets an input of
+its own, a column (B, ...) of every call. Plain torch of an engine (`over_rows`) runs under one `vmap` over
+the numbers and the rows of its inputs. Elsewhere, as in the constructor of a module, every operation is a `vmap`
+by itself and returns numbers of rows again. To find the numbers by reading objects would miss what a function
+looks up; they announce themselves.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ class RowNumbers(Tensor):
     def __new__(cls, full: Tensor) -> RowNumbers:
         RowNumbers.made = True
         one = full.detach()[0]
-        numbers: RowNumbers = Tensor._make_wrapper_subclass(  # type: ignore[attr-defined]
+        numbers: RowNumbers = Tensor._make_wrapper_subclass(
             cls, one.shape, strides=one.stride(), dtype=full.dtype, device=full.device, requires_grad=False
         )
         numbers.full = full
@@ -141,19 +141,22 @@ class RowNumbers(Tensor):
         return func(*args, **kwargs)
 
     @classmethod
-    def __torch_dispatch__(
+    def __torch_dispatch__(  # type: ignore[override]
         cls, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
     ) -> Any:
         return _below(func, args, kwargs or {})
 
-    def __repr__(self, **_: Any) -> str:
+    def __repr__(self, *, tensor_contents: Any = None) -> str:
         return f"rows({self.full!r})"
 
     def __format__(self, form: str) -> str:
         return repr(self)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> RowNumbers:
-        return memo.setdefault(id(self), RowNumbers(copy.deepcopy(self.full, memo)))
+        if id(self) not in memo:
+            memo[id(self)] = RowNumbers(copy.deepcopy(self.full, memo))
+        copied: RowNumbers = memo[id(self)]
+        return copied
 
     def __reduce_ex__(self, protocol: Any) -> Any:
         return RowNumbers, (self.full,)
@@ -185,7 +188,7 @@ def resolving(resolve: Resolve) -> Iterator[None]:
 
 @contextmanager
 def of_all_rows() -> Iterator[None]:
-    """What is computed from numbers of rows in the block is numbers of rows, for a decision that all share."""
+    """What follows from numbers of rows in the block is numbers of rows, for a decision that all share."""
     before, _active.resolve = getattr(_active, "resolve", None), None
     try:
         yield
@@ -233,8 +236,8 @@ def columns(numbers: Sequence[RowNumbers], count: int | None) -> list[Tensor]:
 def over_rows(function: Callable[..., Some], *given: Tree) -> Some:
     """function(*given), trees (B, ...) to (B, ...), where the function may read numbers of a row's own.
 
-    It runs once with all rows where it meets none. Else it runs under `torch.func.vmap`, each row with its own
-    numbers and a batch of one; row by row where it decides by values.
+    It runs once with all rows where it meets none. Else it runs under `torch.func.vmap`, each row with its
+    own numbers and a batch of one; row by row where it decides by values.
 
     Args:
         function: of which no row sees another.
@@ -300,7 +303,7 @@ def in_row(row: int, function: Callable[[], Some]) -> Some:
 
 
 def over_some_rows(function: Callable[..., Some], chosen: Tensor, *given: Tree) -> Some:
-    """function(*given) as of `over_rows`, with the numbers of these rows (R,) of all, of which ``given`` is."""
+    """function(*given) as of `over_rows`, where ``given`` is of these rows (R,) of all."""
     with some_rows(chosen):
         return over_rows(function, *given)
 
@@ -400,7 +403,7 @@ def _asks_structure(func: Any) -> bool:
 
 
 def _below(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-    """One operation that no Python function of torch has seen (`torch.as_tensor`), where `vmap` has no say."""
+    """One operation that no Python function of torch has seen (`torch.as_tensor`): `vmap` has no say."""
     if func._schema.name in _ENTRYWISE:
         return RowNumbers(func(args[0].full, *args[1:], **kwargs))
     leaves, spec = tree_flatten((args, kwargs))
@@ -417,5 +420,5 @@ def _below(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
 
 def _other_count(column: Tensor, count: int) -> ValueError:
     return ValueError(
-        f"a batch of {count} rows met numbers that `rows(...)` holds for {len(column)}: both must be one number."
+        f"a batch of {count} rows met numbers of `rows(...)` for {len(column)}: both must be one number."
     )

@@ -29,8 +29,8 @@ Given = ParamSpec("Given")
 def rows(numbers: Tensor | Sequence[nn.Module]) -> Any:
     """Mark numbers of which every row of a batch has its own: the first dimension is the rows.
 
-    Wherever a number may stand, such a tensor may stand: in a plant, a cost, a kernel, a law, in a module or a
-    function of your own, which sees the number of one row, without the dimension of rows. Its meaning is
+    Wherever a number may stand, such a tensor may stand: in a plant, a cost, a kernel, a law, in a module or
+    a function of your own, which sees the number of one row, without the dimension of rows. Its meaning is
     `torch.func.vmap` over the rows; compiled, a row's numbers are columns of a program.
 
     Example:
@@ -92,8 +92,8 @@ class Rowwise(abc.ABCMeta):
     """Metaclass of modules whose methods are functions of points.
 
     A class says in ``rowwise`` which of its methods, and of those of its subclasses, are functions of points:
-    by the name, how many dimensions each argument has without rows. Called with numbers of rows by somebody who
-    has not said whose, such a method takes its arguments (B, ...) row by row; one without rows is for all.
+    by the name, how many dimensions each argument has without rows. Called with numbers of rows by somebody
+    who has not said whose, such a method takes arguments (B, ...) row by row; one without rows is for all.
     """
 
     def __new__(mcs, name: str, bases: tuple[type, ...], space: dict[str, Any], **more: Any) -> Any:
@@ -106,7 +106,7 @@ class Rowwise(abc.ABCMeta):
 
 
 class OfRows(Rowwise):
-    """Metaclass of modules whose constructors decide by values: with numbers of rows they are made row by row."""
+    """Metaclass of modules whose constructors decide by values: with numbers of rows they run row by row."""
 
     @property
     def __signature__(cls) -> inspect.Signature:
@@ -234,7 +234,7 @@ class _Merge:
         if isinstance(first, Derived):
             return kind(**self._dict([value.__getstate__() for value in values], name))
         if hasattr(first, "__dict__") and not isinstance(first, type):
-            made = kind.__new__(kind)
+            made: Any = object.__new__(kind)
             self._made[key] = made
             vars(made).update(self._dict([vars(value) for value in values], name))
             return made
@@ -273,8 +273,8 @@ class _Merge:
     def _differ(self, values: list[Any], name: str) -> ValueError:
         other = next(k for k, value in enumerate(values) if not _equal(value, values[0]))
         return ValueError(
-            f"rows differ in `{name}`, which is no number: {values[0]!r} in row 0 and {values[other]!r} in row "
-            f"{other}; what is no number must be the same in all rows."
+            f"rows differ in `{name}`, which is no number: {values[0]!r} in row 0 and {values[other]!r} in "
+            f"row {other}; what is no number must be the same in all rows."
         )
 
 

@@ -70,7 +70,7 @@ def non_negative(call: str, name: str, value: object) -> Tensor:
 def _in_all_rows(
     call: str, name: str, value: Tensor, holds: Callable[[Tensor], Tensor], rule: str, given: object = None
 ) -> Tensor:
-    """Return a tensor whose entries obey a rule, with the first row that breaks it where rows have their own."""
+    """Return a tensor whose entries obey a rule, of numbers of rows in every row."""
     numbers = all_rows(value)
     if numbers.is_meta or bool((held := holds(numbers)).all()):
         return value

@@ -8,6 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..lanes.row_numbers import RowNumbers
+
 _MOST = 16  # numbers of a tensor that are shown
 _PLAIN = (bool, int, float, str)
 
@@ -20,6 +22,8 @@ def shown(value: Any) -> str:
         return str(value)
     if isinstance(value, float):
         return f"{value:.4g}"
+    if isinstance(value, RowNumbers):
+        return f"rows({shown(value.full)})"
     if value.numel() > _MOST:
         return f"a tensor {tuple(value.shape)}"
     if value.dim() == 2 and 1 < len(value) == value.shape[1] and torch.equal(value, value.diag().diag()):

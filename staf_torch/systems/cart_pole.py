@@ -67,4 +67,5 @@ class CartPole(ControlAffineSystem):
         return torch.stack((zero, zero, push, bend), dim=-1).unsqueeze(-1)
 
     def _reach(self, angle: Tensor) -> Tensor:
-        return self.half_length * (4 / 3 - self.pole * angle.cos().square() / self.total)
+        reach: Tensor = self.half_length * (4 / 3 - self.pole * angle.cos().square() / self.total)
+        return reach

@@ -40,8 +40,9 @@ class PlanarQuadrotor(ControlAffineSystem):
 
     def __init__(self, mass: Number = 1.0, inertia: Number = 0.1, gravity: Number = 9.81) -> None:
         super().__init__()
-        for name, value in (("mass", mass), ("inertia", inertia), ("gravity", gravity)):
-            setattr(self, name, keep(self, name, own_number("PlanarQuadrotor", name, value, "positive")))
+        self.mass = keep(self, "mass", own_number("PlanarQuadrotor", "mass", mass, "positive"))
+        self.inertia = keep(self, "inertia", own_number("PlanarQuadrotor", "inertia", inertia, "positive"))
+        self.gravity = keep(self, "gravity", own_number("PlanarQuadrotor", "gravity", gravity, "positive"))
 
     def drift(self, x: Tensor) -> Tensor:
         angle = x[..., 2]

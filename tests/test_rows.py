@@ -1,0 +1,215 @@
+"""Numbers of a row's own: a batch of B plants, costs, kernels, laws, filters is the loop of B single ones."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+import staf_torch as st
+from staf_torch import adp, lanes, optim, systems, targets
+
+ROWS = 3
+Make = Callable[..., Any]
+
+
+def spread(low: float, high: float, rows: int = ROWS) -> Tensor:
+    return torch.linspace(low, high, rows, dtype=torch.float64)
+
+
+PLANTS: dict[str, tuple[Make, dict[str, tuple[float, float]]]] = {
+    "pendulum": (
+        systems.Pendulum,
+        {"mass": (0.5, 2.0), "length": (0.5, 1.5), "damping": (0.0, 0.3), "gravity": (9.0, 10.0)},
+    ),
+    "cart_pole": (systems.CartPole, {"cart": (0.5, 2.0), "pole": (0.1, 0.3), "half_length": (0.4, 0.6)}),
+    "planar_quadrotor": (systems.PlanarQuadrotor, {"mass": (0.5, 2.0), "inertia": (0.1, 0.2)}),
+    "van_der_pol": (systems.VanDerPol, {"damping": (0.5, 2.0)}),
+    "oscillator": (systems.Oscillator, {"frequency": (0.5, 2.0)}),
+}
+LAWS: dict[str, tuple[Make, tuple[float, float]]] = {
+    "fixed step": (optim.FixedStep, (0.2, 0.9)),
+    "heavy ball": (lambda v: optim.HeavyBall(1.0, v), (0.2, 0.9)),
+    "nesterov": (lambda v: optim.Nesterov(0.9, v), (0.2, 0.9)),
+    "normalised lms": (optim.NormalisedLMS, (0.2, 0.9)),
+    "recursive least squares": (lambda v: optim.RecursiveLeastSquares(0.0, v), (1e-3, 1e-2)),
+}
+KERNELS: dict[str, tuple[Make, tuple[float, float]]] = {
+    "gaussian": (st.GaussianKernel, (0.5, 1.5)),
+    "matern": (lambda v: st.MaternKernel(2.5, v), (0.8, 1.5)),
+    "rational_quadratic": (lambda v: st.RationalQuadraticKernel(v, 0.9), (1.0, 2.0)),
+}
+
+
+class Spring(systems.ControlAffineSystem):
+    """A user's plant, whose number is a buffer."""
+
+    dim, inputs = 2, 1
+
+    def __init__(self, stiffness: Tensor) -> None:
+        super().__init__()
+        self.register_buffer("stiffness", torch.as_tensor(stiffness, dtype=torch.float64))
+
+    def drift(self, x: Tensor) -> Tensor:
+        return torch.stack((x[..., 1], -self.get_buffer("stiffness") * x[..., 0] - 0.1 * x[..., 1]), dim=-1)
+
+    def effectiveness(self, x: Tensor) -> Tensor:
+        return torch.tensor([[0.0], [1.0]]).to(x).expand(*x.shape, 1)
+
+
+@pytest.fixture(params=["always", "never"])
+def either(request: pytest.FixtureRequest) -> Any:
+    with lanes.compiling(request.param):
+        yield request.param
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_plants_of_rows_are_the_loop_of_single_ones(name: str, either: str) -> None:
+    kind, numbers = PLANTS[name]
+    many = kind(**{key: st.rows(spread(*ends)) for key, ends in numbers.items()})
+    x0 = 0.3 * torch.randn(ROWS, many.dim, dtype=torch.float64)
+    states = systems.simulate(many, x0, dt=0.01, steps=20)
+    for row in range(ROWS):
+        one = kind(**{key: float(spread(*ends)[row]) for key, ends in numbers.items()})
+        alone = systems.simulate(one, x0[row : row + 1], dt=0.01, steps=20)[0]
+        assert torch.equal(states[row], alone)
+
+
+def test_a_users_plant_and_cost_run_in_a_closed_loop_under_a_policy_for_all_and_one_each(either: str) -> None:
+    stiff, q, x0 = spread(0.5, 4.0), spread(1.0, 3.0), torch.tensor([[1.0, 0.0]]).double().expand(ROWS, 2)
+    plant, cost = Spring(st.rows(stiff)), adp.QuadraticCost(st.rows(q), 1.0, 2, 1, low=-2.0, high=2.0)
+    nominal = adp.LQR(Spring(torch.tensor(1.0)), adp.QuadraticCost(1.0, 1.0, 2, 1))
+    own = adp.LQR(plant, cost)
+    one = [
+        (Spring(k), adp.QuadraticCost(float(w), 1.0, 2, 1, low=-2.0, high=2.0))
+        for k, w in zip(stiff, q, strict=True)
+    ]
+    for policies in ([nominal] * ROWS, [adp.LQR(*each) for each in one]):
+        shared = policies[0] is nominal
+        run = adp.simulate(nominal if shared else own, plant, cost, x0, dt=0.02, steps=20)
+        for row, (policy, each) in enumerate(zip(policies, one, strict=True)):
+            alone = adp.simulate(policy, *each, x0[row : row + 1], dt=0.02, steps=20)
+            torch.testing.assert_close(run.state[row], alone.state[0], rtol=1e-14, atol=1e-14)
+            torch.testing.assert_close(run.cost[row], alone.cost[0], rtol=1e-14, atol=1e-14)
+    torch.testing.assert_close(own(x0), torch.cat([adp.LQR(*each)(x0[:1]) for each in one]))
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_a_chase_whose_widths_and_radii_differ_is_the_loop_of_chases(name: str, either: str) -> None:
+    kind, ends = KERNELS[name]
+    radii, widths = spread(0.05, 0.2), spread(*ends)
+
+    def basis(width: Any, radius: Any) -> st.StaFBasis:
+        return st.StaFBasis(kind(width), st.StateFollowingCenters(st.rings(3), radius))
+
+    x0 = torch.tensor([[1.0, 0.0]]).double() * spread(0.5, 1.0)[:, None]
+    states = systems.simulate(systems.Oscillator(), x0, dt=0.01, steps=20)
+    law, target = optim.SteepestDescent(), targets.Paper()
+    many = st.chase(states, basis(st.rows(widths), st.rows(radii)), target, law)
+    for row in range(ROWS):
+        alone = st.chase(states[row : row + 1], basis(widths[row], radii[row]), target, law)
+        torch.testing.assert_close(many.weights[row], alone.weights[0], rtol=1e-9, atol=1e-9)
+        torch.testing.assert_close(many.estimate[row], alone.estimate[0], rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_laws_of_rows_are_the_loop_of_single_ones(name: str) -> None:
+    make, ends = LAWS[name]
+    basis = st.StaFBasis(st.GaussianKernel(0.7), st.StateFollowingCenters(st.rings(3), 0.1))
+    x0 = torch.tensor([[1.0, 0.0]]).double() * spread(0.5, 1.0)[:, None]
+    states = systems.simulate(systems.Oscillator(), x0, dt=0.01, steps=20)
+    many = st.chase_weights(states, basis, targets.Paper(), make(st.rows(spread(*ends)))).weights
+    for row in range(ROWS):
+        law = make(float(spread(*ends)[row]))
+        assert torch.equal(
+            st.chase_weights(states[row : row + 1], basis, targets.Paper(), law).weights[0], many[row]
+        )
+
+
+def test_scenes_with_discs_of_their_own_stand_behind_one_filter() -> None:
+    plant = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
+    cost, walls = adp.QuadraticCost(1.0, 1.0, 2, 1), spread(-0.3, 0.1)
+    lqr, x0 = adp.LQR(plant, cost), torch.tensor([[1.0, -1.0]]).double().expand(ROWS, 2)
+
+    def safe(wall: Tensor) -> adp.SafetyFilter:
+        return adp.SafetyFilter(lqr, plant, lambda x, t: x[:, 0] - wall, dt=0.05, low=-3.0, high=3.0)
+
+    with lanes.compiling("always"):
+        run = adp.simulate(safe(st.rows(walls)), plant, cost, x0, steps=30)
+        for row in range(ROWS):
+            alone = adp.simulate(safe(walls[row]), plant, cost, x0[:1], steps=30)
+            assert torch.equal(run.state[row], alone.state[0])
+
+
+def test_a_program_of_a_users_own_takes_columns_and_other_numbers_need_no_compiler() -> None:
+    def program(gain: Tensor, matrix: Tensor) -> lanes.Program:
+        def step(x: Tensor, u: Tensor, row: object) -> tuple[Tensor, Tensor]:
+            x = x + 0.01 * (gain * x.sin() + (x @ matrix.mT) + u.unsqueeze(-1))
+            return x, x.square().sum(-1)
+
+        return lanes.Program(step)
+
+    for rows, dtype in ((1, torch.float64), (2, torch.float64), (7, torch.float32), (100, torch.float64)):
+        gain, matrix = torch.rand(rows, dtype=dtype), torch.randn(rows, 2, 2, dtype=dtype)
+        x0, u = torch.randn(rows, 2, dtype=dtype), torch.randn(rows, 5, dtype=dtype)
+        gain[-1] = torch.nan
+        made = program(st.rows(gain), st.rows(matrix))
+        x, out = made(x0, u)
+        assert made.compiled
+        want, told = made.definition(x0, u)
+        torch.testing.assert_close(x, want, equal_nan=True)
+        torch.testing.assert_close(out, told, equal_nan=True)
+        assert bool(x[-1].isnan().all())  # its own row alone
+        assert not bool(x[:-1].isnan().any())
+        alone, _ = program(st.rows(gain[:1]), st.rows(matrix[:1]))(x0[:1], u[:1])
+        torch.testing.assert_close(alone[0], x[0], rtol=0, atol=0, equal_nan=True)
+        gain.fill_(0.0)
+        torch.testing.assert_close(made(x0, u)[0], made.definition(x0, u)[0])
+    with pytest.raises(ValueError, match=r"a batch of 3 rows met numbers of `rows\(\.\.\.\)` for 100"):
+        made(x0[:3], u[:3])
+
+
+def test_modules_of_one_class_become_one_with_the_numbers_of_all() -> None:
+    plants, x = [systems.Pendulum(mass=m) for m in (1.0, 2.0)], torch.randn(2, 2).double()
+    many = st.rows(plants)
+    assert torch.equal(many.drift(x), torch.stack([p.drift(x[k]) for k, p in enumerate(plants)]))
+    nets = [nn.Linear(2, 1).double() for _ in range(2)]
+    step = lanes.Program(lambda x, _, row: (x, net(x)))
+    net = st.rows(nets)
+    with torch.no_grad():
+        for found in (step(x, steps=1)[1], step.definition(x, steps=1)[1]):
+            torch.testing.assert_close(found[:, 0], torch.stack([n(x[k]) for k, n in enumerate(nets)]))
+    with pytest.raises(ValueError, match="must be modules of one class; got Pendulum, VanDerPol"):
+        st.rows([systems.Pendulum(), systems.VanDerPol()])
+
+
+def test_a_rule_names_the_first_row_that_breaks_it() -> None:
+    for make in (
+        lambda: systems.Pendulum(mass=st.rows(torch.tensor([1.0, -1.0]))),
+        lambda: st.GaussianKernel(st.rows(torch.tensor([1.0, -1.0]))),
+        lambda: optim.FixedStep(st.rows(torch.tensor([1.0, 3.0]))),
+        lambda: adp.QuadraticCost(st.rows(torch.tensor([1.0, -1.0])), 1.0, 2, 1),
+    ):
+        with pytest.raises(ValueError, match="row 1"):
+            make()
+    with pytest.raises(ValueError, match="must have a first dimension of rows"):
+        st.rows(torch.tensor(1.0))
+    with pytest.raises(ValueError, match=r"must be floating-point numbers; got torch\.int64"):
+        st.rows(torch.tensor([1]))
+    with pytest.raises(ValueError, match="has no single value"):
+        float(st.rows(torch.ones(2)))
+
+
+def test_numbers_of_rows_survive_copies_casts_and_pickles() -> None:
+    plant = Spring(st.rows(spread(0.5, 4.0)))
+    x = torch.randn(ROWS, 2).double()
+    for other in (copy.deepcopy(plant), pickle.loads(pickle.dumps(plant)), plant.float().double()):
+        torch.testing.assert_close(other.drift(x), plant.drift(x), rtol=1e-6, atol=1e-6)
+    assert "rows(" in repr(systems.Pendulum(mass=st.rows(spread(1.0, 2.0)))) + repr(
+        st.GaussianKernel(st.rows(spread(1.0, 2.0)))
+    )
