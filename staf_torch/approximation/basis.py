@@ -82,7 +82,6 @@ class StaFBasis(nn.Module, metaclass=Rowwise):
     """
 
     rowwise: ClassVar = {
-        "forward": (2, 1),
         "gram": (1,),
         "ideal_weights": (1,),
         "excess": (1, 1),
@@ -129,7 +128,7 @@ class StaFBasis(nn.Module, metaclass=Rowwise):
         """
         trailing("StaFBasis", "y", y, dims=2, last=self.dim)
         if self._unseen and _same(y, x):
-            self.check_own_value(x.detach(), stacklevel=6)
+            self.check_own_value(x.detach(), stacklevel=5)
         sigma: Tensor = self.kernel(y, self.centers(x)).to(torch.promote_types(y.dtype, x.dtype))
         return sigma
 
