@@ -132,7 +132,7 @@ def _called(step: Callable[..., Any], given: Given, rows: Sequence[int], bits: i
         leaves, structure = flatten(given)
         return step(*unflatten(structure, iter([plain(leaf) for leaf in leaves])))
 
-    with few_passes(), some_rows(torch.tensor(rows, dtype=torch.int64)):
+    with few_passes(), some_rows(torch.tensor(rows, dtype=torch.int64, device="cpu")):
         return flatten(over_rows(plainly, carry, now, row))[0]
 
 

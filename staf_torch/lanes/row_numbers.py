@@ -213,7 +213,7 @@ def points_of_rows(count: int, points: int) -> Iterator[None]:
     if not RowNumbers.made:
         yield
         return
-    with some_rows(torch.arange(count).repeat_interleave(points)):
+    with some_rows(torch.arange(count, device="cpu").repeat_interleave(points)):
         yield
 
 
@@ -273,7 +273,7 @@ def each_row(function: Callable[[], Some], most: int | None = None, *, named: bo
     for met in getattr(_active, "met", ()):
         met.append(count)
     few = count if most is None else min(count, most)
-    rows = torch.linspace(0, count - 1, few, dtype=torch.float64).round().long().tolist()
+    rows = torch.linspace(0, count - 1, few, dtype=torch.float64, device="cpu").round().long().tolist()
     found = []
     for row in rows:
         try:

@@ -191,7 +191,7 @@ class _Merge:
         if kind is float:
             if all(value == first or (value != value and first != first) for value in values):
                 return first
-            return RowNumbers(torch.tensor(values, dtype=torch.float64))
+            return RowNumbers(torch.tensor(values, dtype=torch.float64, device="cpu"))
         key = tuple(map(id, values))
         if key not in self._made:
             self._kept.append(values)

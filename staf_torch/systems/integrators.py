@@ -74,7 +74,7 @@ def trajectory(
             continue
         (after, bent, reach), piece = program((x, none, none), steps=stop - start)
         if bool(bent.isnan().all()):  # by plain torch, which takes as long for all states at once as for one
-            some = torch.arange(len(x0)).split(max(1, _TOGETHER // piece.shape[1]))
+            some = torch.arange(len(x0), device=x0.device).split(max(1, _TOGETHER // piece.shape[1]))
             bent = torch.cat([_advanced_rows(system, k, piece[k], dt, 1)[1].amax(1) for k in some])
             reach = piece.abs().amax(-1).amax(1)
         strained = ~(bent <= BENT * reach) & torch.isfinite(reach)

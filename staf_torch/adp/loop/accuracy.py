@@ -74,7 +74,7 @@ def hardest(
         (R, K, n), (R, K, m).
     """
     held = torch.isfinite(control[:, :-1]).all(-1)
-    some = torch.arange(len(state)).split(max(1, _TOGETHER // held.shape[1]))
+    some = torch.arange(len(state), device=state.device).split(max(1, _TOGETHER // held.shape[1]))
     moves = state[:, :-1], control[:, :-1].nan_to_num(0.0)
     bent = torch.cat([over_some_rows(holding.watched, part, *(m[part] for m in moves))[2] for part in some])
     bent = torch.where(held, bent.nan_to_num(math.inf, math.inf), -1.0)

@@ -447,7 +447,9 @@ def square(call: str, name: str, value: Matrix, size: int) -> Tensor:
         given = value.to(torch.float64)
         if given.dim() > 1:
             return given
-        return given.diag() if given.dim() else given * torch.eye(size, dtype=torch.float64)
+        return (
+            given.diag() if given.dim() else given * torch.eye(size, dtype=torch.float64, device=given.device)
+        )
     if isinstance(value, Sequence) and not isinstance(value, str):
         if value and all(isinstance(entry, int | float) for entry in value):
             return torch.tensor(
