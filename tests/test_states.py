@@ -135,7 +135,7 @@ def test_plans_of_float32_states_are_those_of_float64_in_float32() -> None:
 @pytest.mark.parametrize("rows", [2, 3, 5, 7])
 def test_constraints_with_a_wall_a_row_are_refused_for_any_number_of_rows(rows: int) -> None:
     walls = torch.linspace(0.5, 1.5, rows, dtype=torch.float64)
-    with pytest.raises(ValueError, match=r"`SafetyFilter\(constraints=...\)` number 0 .* row's own are not"):
+    with pytest.raises(ValueError, match=r"`SafetyFilter\(constraints=...\)` number 0 .* row's own stand in"):
         adp.SafetyFilter(LQR, PLANT, lambda x, t: walls - x[:, 0], dt=0.05)
 
 

@@ -226,7 +226,7 @@ class CompiledMethod:
 
     def _defined(self, x: Tensor, *more: Tree) -> Any:
         """Compute by the definition, with new tensors beside x whatever the default device is."""
-        if RowNumbers.made:
+        if RowNumbers.made and isinstance(x, Tensor):
             return over_rows(
                 lambda at, *rest: self.definition(plain(at), *rest), Shared(x) if x.dim() < 2 else x, *more
             )

@@ -6,6 +6,7 @@ right shape and wrong numbers. So it is called with other numbers of rows, and i
 
 from __future__ import annotations
 
+import functools
 import weakref
 from collections.abc import Callable, Collection, Sequence
 from typing import Any
@@ -13,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..lanes.row_numbers import each_row
 from . import show
 
 _known: weakref.WeakKeyDictionary[Any, set[Any]] = weakref.WeakKeyDictionary()  # targets that were tried
@@ -62,10 +64,11 @@ def check_rows(
         told = rule.format(what=what, given=came, returned=(count, *inner))
         try:
             with torch.no_grad():
-                found = function(*rows, *shared)
+                (found,) = each_row(functools.partial(function, *rows, *shared), 1)
         except Exception as error:
             said = str(error).splitlines()[0] if str(error) else ""
-            hint = " Numbers of a row's own are not served." if "size" in said or "shape" in said else ""
+            sized = "size" in said or "shape" in said
+            hint = " Numbers of a row's own stand in `staf_torch.rows`." if sized else ""
             hint = " A network in float32 needs `.double()`." if "dtype" in said else hint
             raise ValueError(f"{told}; it raised {type(error).__name__} ({said}).{hint}") from error
         finally:
