@@ -88,7 +88,7 @@ def tuned() -> Any:
 
 def rated(name: str) -> Any:
     cost = COSTS[name]()
-    return cost.rate(X[:, : cost.dim] if cost.dim == 2 else X, X[:, :1])
+    return cost.rate(torch.nn.functional.pad(X, (0, cost.dim - 2)), X[:, :1])
 
 
 THINGS: dict[str, Callable[[], Any]] = {

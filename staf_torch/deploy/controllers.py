@@ -24,6 +24,7 @@ from ..adp import (
 from ..adp.near_optimal import NearOptimal
 from ..adp.planning.receding_horizon import StrainedPlans
 from ..adp.planning.shooting.optimum import PlanReplay
+from ..local_basis.graded import GradedBasis
 from ..numerics.checks import fail, hold, trailing
 from .remembered import RememberedPolicy
 
@@ -302,6 +303,9 @@ def in_dtype(thing: Some, dtype: torch.dtype) -> Some:
                 memo[id(here)] = nn.Parameter(changed) if isinstance(here, nn.Parameter) else changed
             continue
         if isinstance(here, type | ModuleType | FunctionType):
+            continue
+        if isinstance(here, GradedBasis):  # is in float64 whatever it is asked in
+            memo[id(here)] = here
             continue
         for each in gc.get_referents(here):
             if id(each) not in seen:

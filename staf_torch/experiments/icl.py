@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -51,9 +52,10 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     figures = draws(cfg.figures)
     settle = non_negative(COMMAND_LINE, "settle_time", cfg.settle_time)
     plant, gains = published(), _gains(cfg)
+    loops = {name: _loop(cfg, plant, gains, source) for source, name in SOURCES.items()}
     if settle > positive_real(COMMAND_LINE, "duration", cfg.duration):
         raise fail(COMMAND_LINE, "settle_time", "must be before the end", cfg.settle_time)
-    found = {name: _followed(cfg, plant, gains, source) for source, name in SOURCES.items()}
+    found = {name: loop() for name, loop in loops.items()}
     time = found["integral"].time
     late = time >= settle
     if not bool(late.any()):
@@ -84,8 +86,10 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     return study.write(RunDirectory(directory), (lambda: draw_gain_sets(picture)) if figures else None)
 
 
-def _followed(cfg: DictConfig, plant: ParametricPlant, gains: dict[str, Tensor], source: str) -> SourceRun:
-    """The closed loops of all gains with the equations of one source."""
+def _loop(
+    cfg: DictConfig, plant: ParametricPlant, gains: dict[str, Tensor], source: str
+) -> Callable[[], SourceRun]:
+    """Check the settings, and return the run of all gains with the equations of one source."""
     dt = positive_real(COMMAND_LINE, "dt", cfg.dt)
     duration = positive_real(COMMAND_LINE, "duration", cfg.duration)
     noise = real(COMMAND_LINE, "icl.noise", cfg.icl.noise)
@@ -97,14 +101,15 @@ def _followed(cfg: DictConfig, plant: ParametricPlant, gains: dict[str, Tensor],
         plant,
         QuadraticCost(1.0, 1.0, 5, 2, output=lambda z: z[..., :2] - reference(z)[0]),
     )
-    result = method.run(
-        torch.tensor([start], dtype=torch.float64, device="cpu").repeat(len(gains["rate"]), 1),
-        dt=dt,
-        seed=seed_of(cfg),
-        **recorded_times(duration, dt, min(_RECORDED, duration / 20)),
-    )
-    error = result.state[..., :2] - reference(result.state)[0]
-    return SourceRun(result.time, error, result["theta"], int(result.diverged.sum()))
+    x0 = torch.tensor([start], dtype=torch.float64, device="cpu").repeat(len(gains["rate"]), 1)
+
+    def followed() -> SourceRun:
+        times = recorded_times(duration, dt, min(_RECORDED, duration / 20))
+        result = method.run(x0, dt=dt, seed=seed_of(cfg), **times)
+        error = result.state[..., :2] - reference(result.state)[0]
+        return SourceRun(result.time, error, result["theta"], int(result.diverged.sum()))
+
+    return followed
 
 
 def published() -> ParametricPlant:

@@ -5,8 +5,8 @@ written for one plant and means B of them. What a function computes with it is `
 rows. Three readers give it a value. A program that is traced asks for one row's number and gets an input of
 its own, a column (B, ...) of every call. Plain torch of an engine (`over_rows`) runs under one `vmap` over
 the numbers and the rows of its inputs. Elsewhere, as in the constructor of a module, every operation is a
-`vmap` by itself and returns numbers of rows again. To find the numbers by reading objects would miss what a function
-looks up; they announce themselves.
+`vmap` by itself and returns numbers of rows again. To find the numbers by reading objects would miss what a
+function looks up; they announce themselves.
 """
 
 from __future__ import annotations

@@ -356,7 +356,9 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         count = 1 if x.dim() == 1 else x.shape[0]
         outputs = y.shape[-1] if y.dim() == x.dim() else 1
         with x.device:  # whatever the default device is
-            self._streams_ = self._begin(count, outputs, torch.zeros(x.shape[-1], dtype=dtype))
+            self._streams_ = self._begin(
+                count, outputs, torch.zeros(x.shape[-1], dtype=dtype, device=x.device)
+            )
         self._shape_, self._targets_ = tuple(x.shape), tuple(y.shape)
         self._dtype_, self._device_ = dtype, x.device
         self._in_place_ = dtype if self._streams_.compiled else None

@@ -244,10 +244,8 @@ def test_a_model_built_on_the_meta_device_is_filled_by_a_state_dict(name: str, a
 
 
 def test_a_model_without_values_says_how_it_gets_them() -> None:
-    with torch.device("meta"):
-        empty = st.StaF(
-            st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(st.rings(6), radius=0.1))
-        )
+    centers = st.StateFollowingCenters(st.rings(6).to("meta"), radius=0.1)
+    empty = st.StaF(st.StaFBasis(st.ExponentialKernel(), centers))
     empty.to_empty(device="cpu")
     with pytest.raises(ValueError, match=r"built on the meta device must be given its values first"):
         empty(torch.zeros(1, 2, dtype=torch.float64))

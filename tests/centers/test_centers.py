@@ -176,7 +176,10 @@ def test_permuted_centers_permute_the_weights_and_leave_the_estimate(
         (lambda: st.StateFollowingCenters(torch.zeros(0, 2), 0.1), "must have the shape (M, n); got (0, 2)"),
         (lambda: st.StateFollowingCenters(torch.zeros(1, 2, 2), 0.1), "must have the shape (M, n)"),
         (lambda: st.StateFollowingCenters(tensor([[math.nan, 0.0]]), 0.1), "must be finite"),
-        (lambda: st.StateFollowingCenters([[0.0]], 0.1), "(directions=...)` must be a tensor; got [[0.0]]."),
+        (
+            lambda: st.StateFollowingCenters([[0.0]], 0.1),
+            "(directions=...)` must be a tensor, as by `torch.as_tensor(x, dtype=torch.float64)`; got [[0.0]]",
+        ),
         (
             lambda: st.StateFollowingCenters(st.rings(3), 0.1)(tensor([1.0])),
             "must have 2 entries in its last",

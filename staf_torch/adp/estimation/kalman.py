@@ -69,7 +69,7 @@ class KalmanFilter(abc.ABC):
         if tuple(seen.shape) != (1, len(noise)):
             raise fail(name, "output", f"must map (1, {n}) to (1, {len(noise)})", tuple(seen.shape))
         q = len(noise)
-        check_rows(f"{name}(output=...)", output, [torch.zeros(n, dtype=torch.float64)], (q,))
+        check_rows(f"{name}(output=...)", output, [torch.zeros(n, dtype=torch.float64, device="cpu")], (q,))
         if not set(periodic) <= set(range(-q, q)):
             raise fail(name, "periodic", f"must be places of {q} outputs", list(periodic))
         angles = {index % q for index in periodic}

@@ -99,7 +99,8 @@ class Cost(nn.Module, metaclass=OfRows):
         name = type(self).__name__
         self.dim, self.inputs, self.output = dim, inputs, output
         self.target = _point(name, "target", target, dim)
-        tried = torch.zeros(dim, dtype=torch.float64) if self.target is None else self.target
+        zeros = torch.zeros(dim, dtype=torch.float64, device="cpu")
+        tried = zeros if self.target is None else self.target
         seen = dim if output is None else _outputs(name, output, tried, inputs)
         q = positive_semidefinite(name, "state", square(name, "state", state, seen), seen)
         self.register_buffer("q", q)

@@ -45,7 +45,8 @@ def check_cost(cost: Cost) -> None:
     """
     if is_ours(type(cost)):
         return
-    name, x, u = type(cost).__name__, state_of(cost), torch.zeros(cost.inputs, dtype=torch.float64)
+    name, x = type(cost).__name__, state_of(cost)
+    u = torch.zeros(cost.inputs, dtype=torch.float64, device="cpu")
     check_rows(f"{name}.state_rate", cost.state_rate, [x], sizes=(len(u),))
     check_rows(f"{name}.input_rate", cost.input_rate, [u], sizes=(len(x),))
     check_rows(f"{name}.rate", cost.rate, [x, u])

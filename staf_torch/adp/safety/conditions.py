@@ -397,7 +397,7 @@ def listed(call: str, constraints: Constraint | Sequence[Constraint], plant: Pla
     several = [constraints] if callable(constraints) else list(constraints)
     if not several or not all(map(callable, several)):
         raise fail(call, "constraints", "must be h(x, t) or a list of them", constraints)
-    x, t = plant.equilibrium(), torch.zeros((), dtype=torch.float64)
+    x, t = plant.equilibrium(), torch.zeros((), dtype=torch.float64, device="cpu")
     sizes = (len(several), plant.inputs, _PROBES, len(TIMES), _PROBES * len(TIMES))
     for k, h in enumerate(several):
         check_rows(f"{call}(constraints=...)` number {k} `h(x, t)", h, [x], shared=[t], sizes=sizes)
