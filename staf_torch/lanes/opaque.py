@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from types import CodeType
 from typing import Any, ParamSpec, TypeVar
 
 import torch._C._dynamo.eval_frame as frames
@@ -19,6 +18,16 @@ def opaque(function: Callable[_P, _R]) -> Callable[_P, _R]:
     To trace a loop that `lanes` compiles takes minutes, and what comes out is hundreds of times slower. The
     decorator of torch imports its compiler, which takes a second; this one does not.
     """
+    if not hasattr(frames, "set_code_exec_strategy"):  # torch 2.6
+        return _alone(function)
+    _marked(function)
+    actions = frames._FrameAction
+    frames.set_code_exec_strategy(function.__code__, frames._FrameExecStrategy(actions.SKIP, actions.SKIP))  # type: ignore[attr-defined]
+    return function
+
+
+def _alone(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Return a function that sees to it by itself that nobody compiles what it calls."""
     set_frames = frames.set_eval_frame
 
     @functools.wraps(function)
@@ -29,17 +38,12 @@ def opaque(function: Callable[_P, _R]) -> Callable[_P, _R]:
         finally:
             set_frames(before)
 
-    marked: Any = alone
-    _skipped(marked.__code__)
-    marked._torchdynamo_disable, marked._torchdynamo_disable_recursive = True, True
-    marked._torchdynamo_disable_msg = "it compiles itself"
+    frames.skip_code(alone.__code__)  # type: ignore[attr-defined]
+    _marked(alone)
     return alone
 
 
-def _skipped(code: CodeType) -> None:
-    """Have torch run frames of a code as they stand."""
-    if hasattr(frames, "skip_code"):  # up to 2.6
-        frames.skip_code(code)
-    else:
-        actions = frames._FrameAction
-        frames.set_code_exec_strategy(code, frames._FrameExecStrategy(actions.SKIP, actions.DEFAULT))
+def _marked(function: Any) -> None:
+    """Have torch call a function in place of looking into it."""
+    function._torchdynamo_disable, function._torchdynamo_disable_recursive = True, True
+    function._torchdynamo_disable_msg = "it compiles itself"

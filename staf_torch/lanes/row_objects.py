@@ -35,12 +35,12 @@ def rows(numbers: Tensor | Sequence[nn.Module]) -> Any:
 
     Example:
         >>> masses = torch.linspace(0.5, 2.0, 4).double()
-        >>> plant = systems.Pendulum(mass=staf_torch.rows(masses))
+        >>> plant = systems.Pendulum(mass=rows(masses))
         >>> x0 = torch.tensor([[1.0, 0.0]]).double().expand(4, 2)
         >>> systems.simulate(plant, x0, dt=0.01, steps=100).shape  # four pendulums
         torch.Size([4, 101, 2])
 
-        Shown by `staf_torch/lanes/README.md`.
+        Shown by `staf_torch/lanes/ROWS.md`.
 
     Args:
         numbers: (B, ...), floating-point; or B modules of one class, which differ in numbers: the module that

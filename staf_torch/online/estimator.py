@@ -221,7 +221,10 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         lapse, twin = lapses(self._call("fit"), time, states), self._twin()
         with Sign(self._call("fit"), len(states), "samples") as sign:
             for k, (state, value) in enumerate(zip(states, values, strict=True)):
-                twin._learn(state, value, None if lapse is None else lapse[k])
+                if lapse is None:
+                    twin.partial_fit(state, value)
+                else:
+                    twin._learn(state, value, lapse[k])
                 sign.advance()
         self._change(self._take_over, twin)
         return self

@@ -178,7 +178,7 @@ def test_permuted_centers_permute_the_weights_and_leave_the_estimate(
         (lambda: st.StateFollowingCenters(tensor([[math.nan, 0.0]]), 0.1), "must be finite"),
         (
             lambda: st.StateFollowingCenters([[0.0]], 0.1),
-            "(directions=...)` must be a tensor, as by `torch.as_tensor(x, dtype=torch.float64)`; got [[0.0]]",
+            "(directions=...)` must be a tensor, as by `torch.as_tensor(x, dtype=torch.float64)`",
         ),
         (
             lambda: st.StateFollowingCenters(st.rings(3), 0.1)(tensor([1.0])),
