@@ -22,7 +22,7 @@ def opaque(function: Callable[_P, _R]) -> Callable[_P, _R]:
         return _alone(function)
     _marked(function)
     actions = frames._FrameAction
-    frames.set_code_exec_strategy(function.__code__, frames._FrameExecStrategy(actions.SKIP, actions.SKIP))  # type: ignore[attr-defined]
+    frames.set_code_exec_strategy(function.__code__, frames._FrameExecStrategy(actions.SKIP, actions.SKIP))
     return function
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar
@@ -12,6 +13,11 @@ from torch.utils import _device
 
 Given = ParamSpec("Given")
 Found = TypeVar("Found")
+
+
+def on(device: torch.device) -> contextlib.AbstractContextManager[object]:
+    """Return a context in which new tensors are on a device; of no cost where there is no default device."""
+    return contextlib.nullcontext() if _device.CURRENT_DEVICE is None else device
 
 
 def beside(function: Callable[Given, Found]) -> Callable[Given, Found]:

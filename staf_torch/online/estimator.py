@@ -19,7 +19,7 @@ from ..kernels import NAMED, Kernel
 from ..lanes.locks import ReadWriteLock
 from ..lanes.opaque import opaque
 from ..numerics.checks import choice, fail, integer, trailing
-from ..numerics.default_device import beside
+from ..numerics.default_device import beside, on
 from ..signs import Sign
 from .compiled_filter import DirectCalls
 from .samples import in_place, lapse_of, lapses, like_given, pair, tensor_of
@@ -358,10 +358,7 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         dtype = x.dtype if x.dtype in (torch.float32, torch.float64) else torch.float64
         count = 1 if x.dim() == 1 else x.shape[0]
         outputs = y.shape[-1] if y.dim() == x.dim() else 1
-        with x.device:  # whatever the default device is
-            self._streams_ = self._begin(
-                count, outputs, torch.zeros(x.shape[-1], dtype=dtype, device=x.device)
-            )
+        self._streams_ = self._begin(count, outputs, torch.zeros(x.shape[-1], dtype=dtype, device=x.device))
         self._shape_, self._targets_ = tuple(x.shape), tuple(y.shape)
         self._dtype_, self._device_ = dtype, x.device
         self._in_place_ = dtype if self._streams_.compiled else None
@@ -512,7 +509,7 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         leading = () if streams is None else (streams,)
         x = torch.zeros(*leading, state["n_features_in_"], dtype=dtype, device="cpu")
         twin._prepare(x, x.new_zeros((*leading, *(() if outputs is None else (outputs,)))))
-        with x.device:
+        with on(x.device):
             twin._streams_.load_state_dict(state)
         self._change(self._take_over, twin, state)
         return self

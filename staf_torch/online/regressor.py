@@ -16,6 +16,7 @@ from ..centers.layouts import RING_COUNTS
 from ..kernels import NAMED, Kernel
 from ..lanes.gradients import refuse_gradient
 from ..numerics.checks import choice, fail, flag, integer, positive_real, real
+from ..numerics.default_device import on
 from ..signs import Sign
 from .estimator import StreamEstimator, Streams
 from .filter_streams import FilterStreams
@@ -141,7 +142,7 @@ class StaFRegressor(StreamEstimator):
         states = turned_in_time(states, self._angles(states.shape[-1]))
         targets = values if values.dim() == states.dim() else values.unsqueeze(-1)
         rows = [part.unsqueeze(1) if states.dim() == 2 else part for part in (states, targets)]
-        with states.device:
+        with on(states.device):
             found = tuning(rows[0], rows[1], self._directions(states.shape[-1]))
         self._change(self._hold, found)
         return self
@@ -174,7 +175,7 @@ class StaFRegressor(StreamEstimator):
         both = torch.cat((states.double().reshape(rows), values.double().reshape(rows)), -1)
         n, (center, spread) = states.shape[-1], streams.units_for(both)
         units = (both - center) / spread
-        with states.device:
+        with on(states.device):
             mean, deviation = smooth_record(
                 streams.definition, streams.state, units[..., :n], units[..., n:], whole
             )
