@@ -13,7 +13,7 @@ import pytest
 
 import staf_torch as st
 from staf_torch.online import MixtureRegressor, RiverRegressor
-from staf_torch.online.estimator import NotFittedError
+from staf_torch.online.scikit_estimator import NotFittedError
 
 EXPECTED = {
     "check_fit2d_predict1d": "a single point (n,) is a prediction of one stream",
