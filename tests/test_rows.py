@@ -178,6 +178,9 @@ def test_modules_of_one_class_become_one_with_the_numbers_of_all() -> None:
     plants, x = [systems.Pendulum(mass=m) for m in (1.0, 2.0)], torch.randn(2, 2).double()
     many = st.rows(plants)
     assert torch.equal(many.drift(x), torch.stack([p.drift(x[k]) for k, p in enumerate(plants)]))
+    u = torch.randn(2, 1).double()
+    assert torch.equal(many.rate(x, u=u), torch.stack([p.rate(x[k], u[k]) for k, p in enumerate(plants)]))
+    assert many.drift(x[0]).shape == (2, 2)  # a point without rows is for all
     nets = [nn.Linear(2, 1).double() for _ in range(2)]
     step = lanes.Program(lambda x, _, row: (x, net(x)))
     net = st.rows(nets)

@@ -243,8 +243,8 @@ def over_rows(function: Callable[..., Some], *given: Tree) -> Some:
         function: of which no row sees another.
         given: trees of tensors (B, ...), and `Shared` ones.
     """
-    if getattr(_active, "resolve", None) is not None and not _tried():  # somebody outside has said whose
-        return function(*given)
+    if not RowNumbers.made or (getattr(_active, "resolve", None) is not None and not _tried()):
+        return function(*given)  # there are none, or somebody outside has said whose
     try:
         with resolving(_refuse):
             return function(*given)
@@ -263,7 +263,7 @@ def each_row(function: Callable[[], Some], most: int | None = None, *, named: bo
         most: rows, spread over all of them; all by default.
         named: whether an error says of which row it is.
     """
-    if getattr(_active, "resolve", None) is not None:
+    if not in_use():
         return [function()]
     try:
         with resolving(_refuse):

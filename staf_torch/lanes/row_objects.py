@@ -83,6 +83,8 @@ def by_rows(function: Callable[Given, Some]) -> Callable[Given, Some]:
 
 def made_by_rows(make: Callable[[], Some]) -> Some:
     """Return what ``make`` returns; where it reads numbers of rows, that of all rows, merged."""
+    if not in_use():
+        return make()
     with met_rows() as met:
         found = each_row(make, named=True)
     return merged(found) if met else found[0]
@@ -116,8 +118,9 @@ class OfRows(Rowwise):
 
     def __call__(cls: type[Some], *args: Any, **kwargs: Any) -> Some:
         make: Callable[..., Some] = super().__call__  # type: ignore[misc]
-        own = [value for value in (*args, *kwargs.values()) if isinstance(value, RowNumbers)]
-        if not own or not in_use():
+        if not in_use():
+            return make(*args, **kwargs)
+        if not any(isinstance(value, RowNumbers) for value in (*args, *kwargs.values())):
             return made_by_rows(lambda: make(*args, **kwargs))
         try:
             with refused():
@@ -134,10 +137,13 @@ class OfRows(Rowwise):
 def _of_points(method: Any, dims: Sequence[int]) -> Any:
     """Return a method that takes points (B, ...) row by row where it reads numbers of rows."""
 
+    signature = inspect.signature(method)
+
     @functools.wraps(method)
     def of_points(self: Any, *args: Any, **kwargs: Any) -> Any:
-        if not in_use() or kwargs:
+        if not in_use():
             return method(self, *args, **kwargs)
+        args = signature.bind(self, *args, **kwargs).args[1:] if kwargs else args
         given = [_with_rows(arg, size) for arg, size in zip(args, dims, strict=False)]
         rest = args[len(given) :]
 
