@@ -191,7 +191,7 @@ def inside(calls: int, seed: int, chosen: Sequence[str]) -> None:
         signal.alarm(0)
         counts[name] += 1
     built = list(Path(os.environ["XDG_CACHE_HOME"], "staf_torch").rglob("*.so"))
-    names = {library.name.rpartition("-")[0] for library in built}
+    names = {library.name.partition("-")[0] for library in built}
     assert names >= {LIBRARIES[kind] for kind in chosen}, names
     bare = [str(library) for library in built if b"__asan_report_load" not in library.read_bytes()]
     assert not bare, bare
