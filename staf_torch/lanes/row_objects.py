@@ -118,7 +118,7 @@ class OfRows(Rowwise):
 
     def __call__(cls: type[Some], *args: Any, **kwargs: Any) -> Some:
         make: Callable[..., Some] = super().__call__  # type: ignore[misc]
-        if not in_use():
+        if not RowNumbers.made or not in_use():
             return make(*args, **kwargs)
         if not any(isinstance(value, RowNumbers) for value in (*args, *kwargs.values())):
             return made_by_rows(lambda: make(*args, **kwargs))
@@ -141,7 +141,7 @@ def _of_points(method: Any, dims: Sequence[int]) -> Any:
 
     @functools.wraps(method)
     def of_points(self: Any, *args: Any, **kwargs: Any) -> Any:
-        if not in_use():
+        if not RowNumbers.made or not in_use():  # the first for speed
             return method(self, *args, **kwargs)
         args = signature.bind(self, *args, **kwargs).args[1:] if kwargs else args
         given = [_with_rows(arg, size) for arg, size in zip(args, dims, strict=False)]
