@@ -191,6 +191,30 @@ def test_modules_of_one_class_become_one_with_the_numbers_of_all() -> None:
         st.rows([systems.Pendulum(), systems.VanDerPol()])
 
 
+def test_a_batch_of_another_size_is_refused_with_both_numbers() -> None:
+    plant, cost = systems.Pendulum(mass=st.rows(torch.ones(ROWS).double())), adp.QuadraticCost(1.0, 1.0, 2, 1)
+    x0, policy = torch.rand(ROWS + 1, 2).double(), adp.LQR(systems.Pendulum(), cost)
+    for run in (
+        lambda: systems.simulate(plant, x0, dt=0.01, steps=3),
+        lambda: adp.simulate(policy, plant, cost, x0, dt=0.01, steps=3),
+        lambda: plant.drift(x0),
+    ):
+        with pytest.raises(ValueError, match=r"a batch of 4 rows met numbers of .* for 3"):
+            run()
+
+
+def test_what_does_not_serve_rows_yet_says_so() -> None:
+    plant, cost = systems.Pendulum(mass=st.rows(spread(1.0, 2.0))), adp.QuadraticCost(1.0, 1.0, 2, 1)
+    for make in (
+        lambda: adp.near_optimal(plant, cost, dt=0.1),
+        lambda: adp.BoxDDP(adp.SampledProblem.of(plant, cost, dt=0.1), steps=3),
+        lambda: adp.DirectShooting(plant, cost, 1.0),
+        lambda: adp.RolloutPolicy.of_lqr(plant, cost),
+    ):
+        with pytest.raises(ValueError, match="must have no numbers of a row's own"):
+            make()
+
+
 def test_a_rule_names_the_first_row_that_breaks_it() -> None:
     for make in (
         lambda: systems.Pendulum(mass=st.rows(torch.tensor([1.0, -1.0]))),

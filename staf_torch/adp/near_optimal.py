@@ -17,6 +17,7 @@ from ..kernels import ExponentialKernel
 from ..lanes import ready, where_rows
 from ..lanes.gradients import marked, refuse_gradient, without_gradient
 from ..lanes.opaque import opaque
+from ..lanes.row_objects import refuse_rows
 from ..numerics.checks import choice, flag, integer, positive_real
 from ..numerics.default_device import beside
 from ..numerics.shown import shown, sizes
@@ -379,6 +380,7 @@ def near_optimal(
             is no global value; the message says why.
     """
     choice("near_optimal", "reach", reach, _WAYS)
+    refuse_rows("near_optimal", plant=plant, cost=cost)
     period = held_period("near_optimal", plant, dt)
     check_still("near_optimal", "plant", plant, "`RecedingHorizon` or `LQR`")
     check_endless("near_optimal", "cost", cost.ending, "the policy knows no end; plans do, `RecedingHorizon`")

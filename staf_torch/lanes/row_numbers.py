@@ -11,7 +11,6 @@ function looks up; they announce themselves.
 
 from __future__ import annotations
 
-import contextlib
 import copy
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -306,11 +305,6 @@ def over_some_rows(function: Callable[..., Some], chosen: Tensor, *given: Tree) 
     """function(*given) as of `over_rows`, where ``given`` is of these rows (R,) of all."""
     with some_rows(chosen):
         return over_rows(function, *given)
-
-
-def refused() -> contextlib.AbstractContextManager[None]:
-    """Return the context in which to read numbers of rows raises `RowsMetError`."""
-    return resolving(_refuse)
 
 
 def _refuse(numbers: RowNumbers) -> Tensor:

@@ -18,8 +18,8 @@ from typing import Any, ParamSpec, TypeVar
 import torch
 from torch import Tensor, nn
 
-from .contents import BOUND, Derived
-from .row_numbers import RowNumbers, RowsMetError, each_row, in_use, met_rows, over_rows, refused
+from .contents import BOUND, Contents, Derived
+from .row_numbers import RowNumbers, each_row, in_use, met_rows, over_rows
 from .tree import Shared, plain
 
 Some = TypeVar("Some")
@@ -66,6 +66,22 @@ def rows(numbers: Tensor | Sequence[nn.Module]) -> Any:
         kinds = ", ".join(sorted({type(each).__name__ for each in modules}))
         raise ValueError(f"`rows(numbers=...)` must be modules of one class; got {kinds or 'none'}.")
     return merged(modules)
+
+
+def refuse_rows(call: str, **given: Any) -> None:
+    """Refuse objects with numbers of a row's own, of a door that does not serve them.
+
+    Args:
+        call: the door.
+        given: its arguments by name.
+
+    Raises:
+        ValueError: that names the first one.
+    """
+    for name, value in given.items() if RowNumbers.made else ():
+        if any(isinstance(tensor, RowNumbers) for tensor in Contents(value).tensors):
+            rule = "must have no numbers of a row's own (`staf_torch.rows`), which are not served here yet"
+            raise ValueError(f"`{call}({name}=...)` {rule}: make one for each row.")
 
 
 def by_rows(function: Callable[Given, Some]) -> Callable[Given, Some]:
@@ -123,9 +139,8 @@ class OfRows(Rowwise):
         if not any(isinstance(value, RowNumbers) for value in (*args, *kwargs.values())):
             return made_by_rows(lambda: make(*args, **kwargs))
         try:
-            with refused():
-                return make(*args, **kwargs)
-        except (RowsMetError, ValueError, TypeError):  # it reads them, or takes no tensors
+            return make(*args, **kwargs)  # with all rows at once
+        except (ValueError, TypeError, RuntimeError):  # it decides by values, or takes no tensors
             pass
 
         def one() -> Some:

@@ -15,6 +15,7 @@ from ...kernels import ExponentialKernel, GaussianKernel, Kernel
 from ...lanes import compiled, each, repeat
 from ...lanes.call import PlannedCall
 from ...lanes.compiled_methods import Rows, check_states
+from ...lanes.row_objects import refuse_rows
 from ...numerics.checks import fail, integer, positive_real, trailing
 from ...numerics.default_device import beside
 from ...numerics.exponential_step import stalls
@@ -95,6 +96,7 @@ class RolloutPolicy(nn.Module):
             )
         if model.dim != basis.dim:
             raise fail("RolloutPolicy", "basis", f"must have the plant's {model.dim} states", basis.dim)
+        refuse_rows("RolloutPolicy", model=model, cost=cost)
         check_problem(model, cost)
         self.basis, self.model, self.cost, self.terminal = basis, model, cost.around(model), terminal
         check_policy("RolloutPolicy", "base", self.cost, base)

@@ -14,6 +14,7 @@ from torch.nn.functional import pad
 
 from ...lanes import each, traced_as
 from ...lanes.gradients import without_gradient
+from ...lanes.row_objects import refuse_rows
 from ...numerics.angles import turned, unwrapped, wrap
 from ...numerics.checks import fail, integer, trailing
 from ...numerics.default_device import beside
@@ -173,6 +174,7 @@ class SampledProblem(nn.Module):
         Raises:
             ValueError: if an argument breaks its rule, or as in `SampledProblem`.
         """
+        refuse_rows("SampledProblem.of", plant=plant, cost=cost)
         check_torch("SampledProblem.of", "plant", plant)
         check_problem(plant, cost)
         cost = cost.bounded(low, high).around(plant)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ....lanes.gradients import without_gradient
 from ....lanes.opaque import opaque
+from ....lanes.row_objects import refuse_rows
 from ....numerics.checks import fail, integer, positive_real, trailing
 from ....numerics.default_device import beside
 from ....numerics.linalg import positive_semidefinite
@@ -138,6 +139,7 @@ class DirectShooting:
         if cost.ending is not None and horizon is None:
             raise fail("DirectShooting", "horizon", "must be given beside a terminal cost", None)
         check_undiscounted("DirectShooting", cost)
+        refuse_rows("DirectShooting", system=system, cost=cost)
         check_problem(system, cost)
         self.stage = Interval(system, cost)
         rates = (1.0, 0.0)
