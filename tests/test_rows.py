@@ -208,7 +208,7 @@ def test_what_does_not_serve_rows_yet_says_so() -> None:
     for make in (
         lambda: adp.near_optimal(plant, cost, dt=0.1),
         lambda: adp.BoxDDP(adp.SampledProblem.of(plant, cost, dt=0.1), steps=3),
-        lambda: adp.DirectShooting(plant, cost, 1.0),
+        lambda: adp.DirectShooting(plant, cost, horizon=1.0),
         lambda: adp.RolloutPolicy.of_lqr(plant, cost),
     ):
         with pytest.raises(ValueError, match="must have no numbers of a row's own"):
