@@ -201,6 +201,19 @@ def test_a_batch_of_another_size_is_refused_with_both_numbers() -> None:
     ):
         with pytest.raises(ValueError, match=r"a batch of 4 rows met numbers of .* for 3"):
             run()
+    with pytest.raises(ValueError, match=r"met numbers of .* for 5"):  # nor do the first three of five serve
+        adp.LQR(plant, adp.QuadraticCost(st.rows(spread(1.0, 2.0, 5)), 1.0, 2, 1))
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_centers_and_a_basis_called_directly_take_rows(count: int) -> None:
+    radii, x = spread(0.1, 0.3), torch.randn(ROWS, 2).double()
+    layout = st.rings(3) if count == 3 else st.polygon(1)
+    many = st.StateFollowingCenters(layout, st.rows(radii))
+    for row in range(ROWS):
+        one = st.StateFollowingCenters(layout, radii[row])
+        torch.testing.assert_close(many(x)[row], one(x[row]), rtol=1e-15, atol=0)
+        torch.testing.assert_close(many.offsets(x)[row], one.offsets(x[row]), rtol=1e-15, atol=0)
 
 
 def test_what_does_not_serve_rows_yet_says_so() -> None:

@@ -128,7 +128,7 @@ class StateFollowingCenters(nn.Module, metaclass=Rowwise):
     Source: Rosenfeld et al., section 2.
     """
 
-    rowwise: ClassVar = {"forward": (1,), "offsets": (1,)}
+    rowwise: ClassVar = {"forward": (1,)}
 
     def __init__(self, directions: Tensor, radius: float | Tensor | Radius) -> None:
         super().__init__()

@@ -176,19 +176,12 @@ def all_rows(tensor: Tensor) -> Tensor:
 
 
 @contextmanager
-def resolving(resolve: Resolve) -> Iterator[None]:
-    """Numbers of rows have, within the block and on this thread, the value that ``resolve`` gives them."""
+def resolving(resolve: Resolve | None) -> Iterator[None]:
+    """Numbers of rows have, within the block and on this thread, the value that ``resolve`` gives them.
+
+    With None what follows from them is numbers of rows, too, for a decision that all rows share.
+    """
     before, _active.resolve = getattr(_active, "resolve", None), resolve
-    try:
-        yield
-    finally:
-        _active.resolve = before
-
-
-@contextmanager
-def of_all_rows() -> Iterator[None]:
-    """What follows from numbers of rows in the block is numbers of rows, for a decision that all share."""
-    before, _active.resolve = getattr(_active, "resolve", None), None
     try:
         yield
     finally:
@@ -276,7 +269,7 @@ def each_row(function: Callable[[], Some], most: int | None = None, *, named: bo
     found = []
     for row in rows:
         try:
-            found.append(in_row(row, function))
+            found.append(_in_row(row, count, function))
         except ValueError as error:
             if not named:
                 raise
@@ -295,9 +288,9 @@ def met_rows() -> Iterator[list[int]]:
         _active.met = before
 
 
-def in_row(row: int, function: Callable[[], Some]) -> Some:
-    """function() with the numbers of one row."""
-    with resolving(lambda numbers: columns([numbers], None)[0][row]):
+def _in_row(row: int, count: int, function: Callable[[], Some]) -> Some:
+    """function() with the numbers of one row of so many."""
+    with resolving(lambda numbers: columns([numbers], count)[0][row]):
         return function()
 
 

@@ -158,12 +158,15 @@ def _of_points(method: Any, dims: Sequence[int]) -> Any:
     def of_points(self: Any, *args: Any, **kwargs: Any) -> Any:
         if not RowNumbers.made or not in_use():  # the first for speed
             return method(self, *args, **kwargs)
-        args = signature.bind(self, *args, **kwargs).args[1:] if kwargs else args
+        if kwargs:
+            bound = signature.bind(self, *args, **kwargs)
+            args, kwargs = bound.args[1:], bound.kwargs
         given = [_with_rows(arg, size) for arg, size in zip(args, dims, strict=False)]
         rest = args[len(given) :]
 
         def at(*points: Any) -> Any:
-            return method(self, *(plain(p) if isinstance(p, Shared | Tensor) else p for p in points), *rest)
+            alone = (plain(p) if isinstance(p, Shared | Tensor) else p for p in points)
+            return method(self, *alone, *rest, **kwargs)
 
         return over_rows(at, *given)
 

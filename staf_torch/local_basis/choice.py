@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from ..centers import StateFollowingCenters
 from ..kernels import Kernel, PolynomialKernel
 from ..lanes.loops import untraced
-from ..lanes.row_numbers import all_rows, of_all_rows
+from ..lanes.row_numbers import all_rows, resolving
 from .base import LocalSpace
 from .elimination import Degrees, degrees_of
 from .graded import SERIES_BELOW, GradedBasis, GradedSpace, graded_basis
@@ -93,7 +93,7 @@ class LocalBasis:
         """Return whether one series in the squared radius serves the fits at all states: `Interpolation`."""
         if any(True for part in (kernel, centers.radius) for _ in part.parameters()):
             return False  # what is learned may grow, and has derivatives that the series' setup has not
-        with untraced(), of_all_rows():
+        with untraced(), resolving(None):
             rate, bound = kernel.exponent_rate(), centers.radius.bound()
             if rate is None or bound is None or self.degrees is None or bound.is_meta:
                 return False
