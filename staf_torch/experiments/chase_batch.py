@@ -18,12 +18,13 @@ from ..results.files import grouped
 from ..settings.chase import ChaseProblem, warnings_to
 from ..systems import trajectory
 
-Sink = Callable[[Mapping[str, np.ndarray]], None]
-"""Takes the next piece of time of a problem's history: name -> (b, C, ...)."""
+Sink = Callable[[Mapping[str, np.ndarray], int], None]
+"""Takes the next piece of time of a block of a problem's rows, name -> (b, C, ...), and its first row."""
 
 HISTORY = ("state", "value", "estimate", "weights", "ideal_weights", "excess")
 _DRAWN = (*HISTORY, "ideal_estimate")
-_ROWS = 4096  # that go through time together where nobody keeps a history: memory does not grow with rows
+_ROWS = 4096  # at most that go through time together: memory does not grow with rows
+_FEW, _BYTES = 64, 2**26  # rows at least, and bytes at most, where a history is kept: it is written by rows
 _DRAWN_TIMES = 4000  # more could not be told apart in print
 
 
@@ -95,8 +96,11 @@ def _run(
         errors=errors,
     )
     tell = _of_whole_problems(advance, len(starts), len(members))
-    # What a history holds of a time, it holds of all rows.
-    together = len(starts) if any(member.sink is not None for member in members) else _ROWS
+    together = _ROWS
+    if any(member.sink is not None for member in members):
+        kept = starts.shape[1] + 3 + 2 * first.basis.count  # numbers of a row and time, of `HISTORY`
+        whole = _BYTES // (times * kept * starts.element_size())  # rows with all times
+        together = min(_ROWS, max(_FEW, whole))
     blocks = starts.split(together)
     chunk = chunk_length(min(together, len(starts)), first.basis, starts.element_size())
     # Some twenty pieces of a long run, so that progress is seen; the results do not depend on it.
@@ -171,7 +175,7 @@ class _BatchMember:
         if self._thinned is not None and place == 0:
             self._thinned.add(result, rows.start)
         if self.sink is not None:
-            self.sink({name: getattr(result, name)[rows].cpu().numpy() for name in HISTORY})
+            self.sink({name: getattr(result, name)[rows].cpu().numpy() for name in HISTORY}, place)
         self._diverged_at[place : place + rows.stop - rows.start] = result.diverged_at[rows].cpu()
         if not alone and not self._warnings:
             with warnings_to(self._warnings):

@@ -183,15 +183,17 @@ class _Memory:
     """A history kept in memory."""
 
     def __init__(self, batch: int, times: int) -> None:
-        self._shape, self._done = (batch, times), 0
+        self._shape, self._row, self._done = (batch, times), 0, 0
         self.arrays: dict[str, np.ndarray] = {}
 
-    def add(self, pieces: Mapping[str, np.ndarray]) -> None:
-        start, length = self._done, next(iter(pieces.values())).shape[1]
+    def add(self, pieces: Mapping[str, np.ndarray], row: int) -> None:
+        if row != self._row:
+            self._row, self._done = row, 0
+        start, (rows, length) = self._done, next(iter(pieces.values())).shape[:2]
         for name, piece in pieces.items():
             if name not in self.arrays:
                 self.arrays[name] = np.empty((*self._shape, *piece.shape[2:]), piece.dtype)
-            self.arrays[name][:, start : start + length] = piece
+            self.arrays[name][row : row + rows, start : start + length] = piece
         self._done += length
 
 

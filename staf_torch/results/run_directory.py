@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import io
 import math
 import os
-import shutil
-import tempfile
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import Any, BinaryIO, Protocol, TypeVar
 
 import numpy as np
 from numpy.lib.npyio import NpzFile
@@ -20,6 +20,8 @@ from .files import FIGURES, HISTORY, METRICS, open_after, partial_name, write_by
 from .untrusted import UnreadableError, open_regular, visible
 
 T = TypeVar("T")
+_HELD = 2**26
+"""Bytes of a history that are held until they are written."""
 
 
 class Printable(Protocol):
@@ -171,11 +173,12 @@ class History(Mapping[str, np.ndarray]):
 
 
 class HistoryWriter:
-    """Write arrays (B, T, ...) that arrive in pieces (B, C, ...) of consecutive times.
+    """Write arrays (B, T, ...) that arrive in blocks of rows, each in pieces (b, C, ...) of time.
 
-    Memory does not grow with T: the pieces go to scratch files beside the archive; `close` packs them, and
-    the archive appears at once and complete, or not at all. A context manager: leaving it by an exception
-    removes the scratch files.
+    Memory grows neither with B nor with T. The pieces of a block of rows are held until all its times are
+    there, or a budget is full; they go into a hidden archive beside the place of the final one in a few large
+    writes, each to where it stays. The archive appears at once and complete, or not at all. A context
+    manager: leaving it by an exception removes the hidden file.
 
     Args:
         path: of the archive.
@@ -188,49 +191,122 @@ class HistoryWriter:
 
     def __init__(self, path: Path, batch: int, times: int) -> None:
         self._path, self._batch, self._times = path, batch, times
-        self._scratch = Path(tempfile.mkdtemp(prefix=".history-", dir=path.parent))
-        self._files: dict[str, tuple[int, int]] = {}  # name -> (descriptor, bytes of the header)
-        self._done = 0
+        self._hidden = path.with_name(partial_name(path.name))
+        self._hidden.unlink(missing_ok=True)  # of a run that was killed
+        flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
+        self._file = os.fdopen(os.open(self._hidden, flags, 0o666), "w+b")
+        self._members: dict[str, _Member] = {}
+        self._held: dict[str, np.ndarray] = {}  # (b, C, ...)
+        self._row = self._done = 0  # of the block: its first row, and the times that were added
+        self._complete = self._fill = 0  # rows with all times; times that are held
 
-    def add(self, pieces: Mapping[str, np.ndarray]) -> None:
-        """Append the next piece of every array, each (B, C, ...) with the same C."""
-        length = next(iter(pieces.values())).shape[1]
-        for name, piece in pieces.items():
-            assert piece.shape[:2] == (self._batch, length)
-            if name not in self._files:
-                self._files[name] = self._open(name, piece)
-            descriptor, header = self._files[name]
-            entry = piece.dtype.itemsize * math.prod(piece.shape[2:])
-            for row, block in enumerate(np.ascontiguousarray(piece)):
-                start = header + entry * (row * self._times + self._done)
-                os.pwrite(descriptor, block.tobytes(), start)
-        self._done += length
+    def add(self, pieces: Mapping[str, np.ndarray], row: int = 0) -> None:
+        """Append the next piece of time of a block of rows, every array (b, C, ...) with the same b and C.
+
+        Args:
+            pieces: the arrays by name, the same names each time.
+            row: the first row of the block. Blocks follow each other, each with all its times.
+        """
+        rows, length = next(iter(pieces.values())).shape[:2]
+        assert all(piece.shape[:2] == (rows, length) for piece in pieces.values())
+        if row != self._row:
+            assert row == self._complete
+            self._row, self._done = row, 0
+        if not self._members:
+            self._reserve(pieces)
+        if any(len(held) != rows for held in self._held.values()) or not self._held:
+            size = sum(piece.nbytes for piece in pieces.values()) // max(1, length)  # of one time
+            room = rows, max(1, min(self._times, _HELD // max(1, size)))
+            self._held = {n: np.empty((*room, *piece.shape[2:]), piece.dtype) for n, piece in pieces.items()}
+        room, taken = next(iter(self._held.values())).shape[1], 0
+        while taken < length:
+            take = min(length - taken, room - self._fill)
+            for name, piece in pieces.items():
+                self._held[name][:, self._fill : self._fill + take] = piece[:, taken : taken + take]
+            taken, self._fill, self._done = taken + take, self._fill + take, self._done + take
+            if self._fill == room or self._done == self._times:
+                self._write(rows)
+        if self._done == self._times:
+            self._complete += rows
 
     def close(self, **whole: np.ndarray) -> None:
-        """Pack the archive, with ``whole`` arrays as they are."""
-        assert self._done == self._times
-        for name, array in whole.items():
-            np.save(self._scratch / f"{name}.npy", array)
-        packed = self._scratch / HISTORY
-        with zipfile.ZipFile(packed, "w", zipfile.ZIP_STORED) as archive:
-            for name in (*whole, *self._files):
-                archive.write(self._scratch / f"{name}.npy", f"{name}.npy")
-        os.replace(packed, self._path)
+        """Complete the archive, with ``whole`` arrays as they are."""
+        assert self._complete == self._batch
+        for member in self._members.values():
+            member.finish(self._file)
+        self._file.seek(0, os.SEEK_END)
+        with zipfile.ZipFile(self._file, "w", zipfile.ZIP_STORED) as archive:
+            for name, array in whole.items():
+                with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+                    np.lib.format.write_array(file, array, allow_pickle=False)
+            archive.filelist += [member.info for member in self._members.values()]
+        self._file.close()  # which may find the disk full
+        os.replace(self._hidden, self._path)
 
     def __enter__(self) -> HistoryWriter:
         return self
 
     def __exit__(self, *raised: object) -> None:
-        for descriptor, _ in self._files.values():
-            os.close(descriptor)
-        shutil.rmtree(self._scratch, ignore_errors=True)
+        with contextlib.suppress(OSError):  # of a full disk, which was told already
+            self._file.close()
+        self._hidden.unlink(missing_ok=True)
 
-    def _open(self, name: str, piece: np.ndarray) -> tuple[int, int]:
-        path = self._scratch / f"{name}.npy"
-        shape = (self._batch, self._times, *piece.shape[2:])
-        with path.open("wb") as file:
-            np.lib.format.write_array_header_1_0(
-                file, {"descr": piece.dtype.str, "fortran_order": False, "shape": shape}
-            )
-            header = file.tell()
-        return os.open(path, os.O_WRONLY), header
+    def _reserve(self, pieces: Mapping[str, np.ndarray]) -> None:
+        """Lay the arrays out in the archive, one behind the other."""
+        begin = 0
+        for name, piece in pieces.items():
+            shape = self._batch, self._times, *piece.shape[2:]
+            self._members[name] = _Member(f"{name}.npy", begin, shape, piece.dtype)
+            begin = self._members[name].end
+        self._file.truncate(begin)
+
+    def _write(self, rows: int) -> None:
+        """Write the times that are held."""
+        times, first = self._fill, self._done - self._fill
+        for name, member in self._members.items():
+            if times == self._times:
+                member.put(self._file, self._row * times, self._held[name])
+                continue
+            for row in range(rows):
+                member.put(self._file, (self._row + row) * self._times + first, self._held[name][row, :times])
+        self._fill = 0
+
+
+class _Member:
+    """An array of an archive whose data arrive in any order.
+
+    Args:
+        name: of its file.
+        begin: where it begins in the archive, in bytes.
+        shape, dtype: of the array.
+    """
+
+    def __init__(self, name: str, begin: int, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+        head, described = io.BytesIO(), {"descr": dtype.str, "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(head, described)
+        self.info, self._head = zipfile.ZipInfo(name), head.getvalue()
+        self.info.header_offset, self.info.CRC = begin, 0
+        self._entry = dtype.itemsize * math.prod(shape[2:])
+        size = len(self._head) + self._entry * shape[0] * shape[1]
+        self.info.file_size = self.info.compress_size = size
+        self._data = begin + len(self.info.FileHeader(zip64=True)) + len(self._head)
+        self.end = self._data - len(self._head) + size
+        self._summed, self._sum = self._data, zlib.crc32(self._head)  # the checksum, up to where it goes
+
+    def put(self, file: BinaryIO, entry: int, block: np.ndarray) -> None:
+        """Write a block at one of the B T entries."""
+        at, data = self._data + self._entry * entry, block.reshape(-1).view(np.uint8).data
+        file.seek(at)
+        file.write(data)
+        if at == self._summed:
+            self._summed, self._sum = at + data.nbytes, zlib.crc32(data, self._sum)
+
+    def finish(self, file: BinaryIO) -> None:
+        """Write what stands before the data."""
+        file.seek(self._summed)
+        while self._summed < self.end:  # the rest did not come in its order
+            data = file.read(min(2**24, self.end - self._summed))
+            self._summed, self._sum = self._summed + len(data), zlib.crc32(data, self._sum)
+        self.info.CRC = self._sum
+        file.seek(self.info.header_offset)
+        file.write(self.info.FileHeader(zip64=True) + self._head)

@@ -24,6 +24,7 @@ from staf_torch.experiments.gradient_chase import ChaseSolution, GradientChase
 from staf_torch.results.progress import Progress
 from staf_torch.settings import config_directory
 from staf_torch.settings.chase import ChaseProblem, chase_problem
+from staf_torch.systems import trajectory
 
 SHORT = ("dt=0.05", "duration=0.5", "settle_time=0.2")
 
@@ -161,18 +162,23 @@ def test_alone_or_in_a_batch_a_chase_has_the_same_metrics_history_and_figure(tmp
 
 
 def test_more_rows_than_go_through_time_together_change_nothing() -> None:
-    """A run without a history goes in blocks of 4096 rows, one with a history in one."""
+    """A run goes in blocks of 4096 rows; its history has the rows in their order."""
     few = ("dt=0.1", "duration=0.3", "settle_time=0.1", "trajectories=4100", "spread=0.4")
     problem = chase_problem(settings(*few))
     told: list[int] = []
-    kept: list[Any] = []
-    (blocks,) = chase_batch.simulate([problem], [None], [True], told.append)
-    (whole,) = chase_batch.simulate([problem], [kept.append], [True])
-    assert {piece["state"].shape[0] for piece in kept} == {4100}
-    assert sum(piece["state"].shape[1] for piece in kept) == sum(told) == 4
-    for name, number in whole.metrics.items():
-        assert blocks.metrics[name] == pytest.approx(number, rel=1e-9, abs=1e-14), name
-    for name, array in whole.drawn.items():
+    kept: dict[int, list[Any]] = {}
+    sink = lambda pieces, row: kept.setdefault(row, []).append(pieces["state"])  # noqa: E731
+    (blocks,) = chase_batch.simulate([problem], [sink], [True], told.append)
+    assert sum(told) == 4
+    assert [*kept] == [0, 4096]
+    states = np.concatenate([np.concatenate(pieces, axis=1) for pieces in kept.values()])
+    start = problem.initial_states
+    whole = trajectory(problem.system, start, dt=problem.dt, steps=3, chunk=4)
+    np.testing.assert_array_equal(states, torch.cat([*whole], dim=1))
+    (few_rows,) = chase_batch.simulate(
+        [dataclasses.replace(problem, initial_states=start[:9])], [None], [True]
+    )
+    for name, array in few_rows.drawn.items():
         np.testing.assert_allclose(blocks.drawn[name], array, rtol=1e-9, atol=1e-12)
 
 
@@ -181,7 +187,7 @@ def test_a_long_trajectory_is_thinned_for_its_figure_as_if_it_came_in_one_piece(
         settings("dt=0.001", "duration=4.01", "settle_time=0.1", "optimizer.inner_steps=1")
     )
     kept: list[Any] = []
-    (found,) = chase_batch.simulate([problem], [kept.append], [True])
+    (found,) = chase_batch.simulate([problem], [lambda pieces, row: kept.append(pieces)], [True])
     assert len(kept) >= 20  # progress is seen
     state = np.concatenate([piece["state"] for piece in kept], axis=1)[0]
     assert state.shape[0] == 4011

@@ -178,12 +178,14 @@ def test_a_history_written_in_pieces_reads_back_as_the_whole_arrays(
     tmp_path_factory: pytest.TempPathFactory, batch: int, times: int, data: some.DataObject, dtype: str
 ) -> None:
     cuts = sorted(data.draw(some.lists(some.integers(0, times), max_size=4)))
+    rows = sorted(data.draw(some.sets(some.integers(1, batch), max_size=2)) - {batch})
     expected = arrays(batch, times, dtype)
     path = tmp_path_factory.mktemp("history") / "history.npz"
     with HistoryWriter(path, batch, times) as writer:
-        for start, stop in zip([0, *cuts], [*cuts, times], strict=True):
-            if stop > start:
-                writer.add({name: array[:, start:stop] for name, array in expected.items()})
+        for low, high in zip([0, *rows], [*rows, batch], strict=True):
+            for start, stop in zip([0, *cuts], [*cuts, times], strict=True):
+                if stop > start:
+                    writer.add({n: array[low:high, start:stop] for n, array in expected.items()}, low)
         assert not path.exists()
         writer.close(time=np.arange(times) * 0.1)
     found = History(path)
@@ -192,6 +194,19 @@ def test_a_history_written_in_pieces_reads_back_as_the_whole_arrays(
         assert found[name].dtype == array.dtype
         np.testing.assert_array_equal(found[name], array)
     assert [entry.name for entry in path.parent.iterdir()] == ["history.npz"]
+
+
+def test_a_history_that_is_too_long_to_be_held_reads_back_as_its_arrays(tmp_path: Path) -> None:
+    long = np.random.default_rng(0).normal(size=(3, 3_000_000)), np.ones((3, 3_000_000), "f4")
+    with HistoryWriter(tmp_path / "history.npz", 3, 3_000_000) as writer:
+        for row, count in ((0, 2), (2, 1)):
+            pieces = {"long": long[0][row : row + count], "zero": long[1][row : row + count]}
+            for start, stop in ((0, 1_000_000), (1_000_000, 3_000_000)):
+                writer.add({n: piece[:, start:stop] for n, piece in pieces.items()}, row)
+        writer.close(time=np.arange(3))
+    found = History(tmp_path / "history.npz")
+    for name, array in zip(("long", "zero"), long, strict=True):
+        np.testing.assert_array_equal(found[name], array)
 
 
 def cut_short(path: Path) -> None:
