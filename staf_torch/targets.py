@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 
-from .numerics.checks import fail, number, real, vector
+from .lanes.row_objects import OfRows
+from .numerics.checks import fail, number, own_number, vector
 
 __all__ = ["Cosine", "Paper", "Quadratic"]
 
@@ -31,7 +33,7 @@ class Paper(nn.Module):
         return x1.square() + 5 * x2.square() + (x1 * x2).tanh()
 
 
-class Quadratic(nn.Module):
+class Quadratic(nn.Module, metaclass=OfRows):
     """V(x) = x'Px.
 
     Example:
@@ -46,6 +48,8 @@ class Quadratic(nn.Module):
     Raises:
         ValueError: if ``matrix`` is neither, or not symmetric.
     """
+
+    rowwise: ClassVar = {"forward": (1,)}
 
     def __init__(self, matrix: float | Sequence[Sequence[float]] | Tensor = 1.0) -> None:
         super().__init__()
@@ -64,7 +68,7 @@ class Quadratic(nn.Module):
         return ((x @ self.matrix.to(x)) * x).sum(-1)
 
 
-class Cosine(nn.Module):
+class Cosine(nn.Module, metaclass=OfRows):
     """V(x) = cos(a'x + phase).
 
     Example:
@@ -74,24 +78,32 @@ class Cosine(nn.Module):
         Shown by `staf target=cosine`.
 
     Args:
-        frequency: a, rad per unit of the state: n numbers, or one for every coordinate.
+        frequency: a, rad per unit of the state: n numbers, (n,), or one for every coordinate.
         phase: rad.
 
     Raises:
         ValueError: if an argument is not finite.
     """
 
-    def __init__(self, frequency: float | Sequence[float] = 1.0, phase: float = 0.0) -> None:
+    rowwise: ClassVar = {"forward": (1,)}
+
+    def __init__(
+        self, frequency: float | Sequence[float] | Tensor = 1.0, phase: float | Tensor = 0.0
+    ) -> None:
         super().__init__()
+        entries = frequency
         if isinstance(frequency, Sequence):
-            a = torch.tensor(vector("Cosine", "frequency", frequency), dtype=torch.float64, device="cpu")
-        else:
-            a = torch.tensor(real("Cosine", "frequency", frequency), dtype=torch.float64, device="cpu")
+            entries = torch.tensor(
+                vector("Cosine", "frequency", frequency), dtype=torch.float64, device="cpu"
+            )
+        a = torch.as_tensor(number("Cosine", "frequency", entries), dtype=torch.float64, device="cpu")
+        if a.dim() > 1:
+            raise fail("Cosine", "frequency", "must be a number or n numbers", frequency)
         self.register_buffer("frequency", a)
         self.frequency: Tensor
         # A tensor, so that a compiled program serves every phase; frequency alone is in a state_dict.
-        number = torch.tensor(real("Cosine", "phase", phase), dtype=torch.float64, device="cpu")
-        self.register_buffer("phase", number, persistent=False)
+        shift = torch.as_tensor(own_number("Cosine", "phase", phase), dtype=torch.float64, device="cpu")
+        self.register_buffer("phase", shift, persistent=False)
         self.phase: Tensor
 
     def forward(self, x: Tensor) -> Tensor:

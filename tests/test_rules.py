@@ -35,7 +35,7 @@ from staf_torch.systems import trajectory
 ROOT = Path(st.__file__).parent
 ELSEWHERE = {"settings", "experiments", "sweeps", "cli"}  # rules of the command line
 OTHERS = {
-    *("ConcurrentTracker", "RobustFilter", "Observed", "ConsiderFilter", "trace", "Cosine", "export_onnx"),
+    *("ConcurrentTracker", "RobustFilter", "Observed", "ConsiderFilter", "trace", "export_onnx"),
     *("paper_step", "StaF.gradient", "StaF.hessian", "ChaseOptimizer", "AvoidanceCost", "plan_around"),
     *("BoxFilter", "DetourPlans", "TwoLinkRobot", "MujocoPlant", "EnergyShaping"),
 }

@@ -11,6 +11,7 @@ from torch.nn.utils import parametrize
 
 from ..centers import StateFollowingCenters
 from ..kernels import Kernel
+from ..lanes.row_numbers import all_rows
 from ..local_basis import Degrees
 
 FORMAT = 2
@@ -61,7 +62,8 @@ def described(module: nn.Module) -> str:
 
 def encode(record: dict[str, Any]) -> Tensor:
     """Return a record as a uint8 tensor of JSON, which every tool that handles a state_dict can carry."""
-    return torch.tensor(list(json.dumps(record, sort_keys=True).encode()), dtype=torch.uint8, device="cpu")
+    text = json.dumps(record, sort_keys=True, default=lambda numbers: all_rows(numbers).tolist())
+    return torch.tensor(list(text.encode()), dtype=torch.uint8, device="cpu")
 
 
 def decode(call: str, stored: Tensor) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from ..lanes.row_objects import OfRows, Rowwise
+from ..lanes.row_objects import OfRows
 from ..numerics.checks import fail, hold, kept, non_negative, positive, shown, trailing, values_of
 
 
@@ -107,7 +107,7 @@ class StateRadius(Radius):
         return kept(self, "radius"), kept(self, "offset", zero=True), kept(self, "gain")
 
 
-class StateFollowingCenters(nn.Module, metaclass=Rowwise):
+class StateFollowingCenters(nn.Module, metaclass=OfRows):
     """c_i(x) = x + nu(x) u_i with directions u_i in the closed unit ball.
 
     Example:

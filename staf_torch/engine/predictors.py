@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ..approximation.basis import StaFBasis, Target
+from ..lanes.row_objects import OfRows
 from ..numerics.checks import choice
 from ..numerics.forward_mode import use_forward_mode
 
@@ -17,7 +18,7 @@ PredictorInputs = tuple[Tensor, ...]
 """What a predictor prepares in bulk: tensors (B, C, ...), those of one time (B, ...)."""
 
 
-class Predictor(abc.ABC):
+class Predictor(metaclass=OfRows):
     """Base class: the weights' step from one time to the next, before they are corrected there.
 
     Like a law it is pure and holds hyperparameters only. The weights of a chase at x_k are e^{g(x_k)} times

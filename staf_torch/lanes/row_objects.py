@@ -136,7 +136,7 @@ class OfRows(Rowwise):
         make: Callable[..., Some] = super().__call__  # type: ignore[misc]
         if not RowNumbers.made or not in_use():
             return make(*args, **kwargs)
-        if not any(isinstance(value, RowNumbers) for value in (*args, *kwargs.values())):
+        if not _holds_rows((args, kwargs)):
             return made_by_rows(lambda: make(*args, **kwargs))
         try:
             return make(*args, **kwargs)  # with all rows at once
@@ -173,8 +173,20 @@ def _of_points(method: Any, dims: Sequence[int]) -> Any:
     return of_points
 
 
+def _holds_rows(value: Any) -> bool:
+    """Return whether numbers of rows are among arguments, also in lists and dictionaries of numbers."""
+    if isinstance(value, list | tuple):
+        return any(map(_holds_rows, value))
+    return _holds_rows([*value.values()]) if isinstance(value, dict) else isinstance(value, RowNumbers)
+
+
 def _alone(value: Any) -> Any:
     """Return the number of the row whose turn it is: a float, or a tensor of more."""
+    if isinstance(value, list | tuple) and _holds_rows(value):
+        parts = map(_alone, value)
+        return type(value)(*parts) if hasattr(value, "_fields") else type(value)(parts)
+    if isinstance(value, dict) and _holds_rows(value):
+        return {name: _alone(part) for name, part in value.items()}
     if not isinstance(value, RowNumbers):
         return value
     tensor = value + 0.0

@@ -11,6 +11,7 @@ from ..centers import StateFollowingCenters
 from ..kernels import Kernel, PolynomialKernel
 from ..lanes.loops import untraced
 from ..lanes.row_numbers import all_rows, resolving
+from ..lanes.row_objects import made_by_rows
 from .base import LocalSpace
 from .elimination import Degrees, degrees_of
 from .graded import SERIES_BELOW, GradedBasis, GradedSpace, graded_basis
@@ -53,7 +54,7 @@ class LocalBasis:
         if self.degrees is None:
             return  # nothing has to, or it comes with a state_dict
         if self.kind == "graded" and not isinstance(directions, nn.Parameter) and not directions.is_meta:
-            self.graded = graded_basis(directions, self.degrees)
+            self.graded = made_by_rows(lambda: graded_basis(directions, self.degrees))
             self._narrow = self.graded.narrow(directions)
             self._prepared_for = directions
 
@@ -124,12 +125,12 @@ def choose(kernel: Kernel, directions: Tensor) -> tuple[str, Degrees | None]:
         ValueError: if directions coincide to rounding, for a graded basis.
     """
     if kernel.exponent_rate() is not None:
-        return "graded", None if directions.is_meta else degrees_of(directions)
+        return "graded", None if directions.is_meta else made_by_rows(lambda: degrees_of(directions))
     highest = kernel.polynomial_degree()
     if highest is not None and directions.is_meta:
         return "polynomial", None
     if highest is not None:
-        degrees = degrees_of(directions)
+        degrees = made_by_rows(lambda: degrees_of(directions))
         # A functional of a higher degree than the kernel's sees nothing: a case for the Newton basis.
         if len(degrees.sizes()) <= highest + 1:
             return "polynomial", degrees

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ..centers.layouts import exponents
+from ..lanes.row_objects import rows
 
 _SINGULAR = 1e-12  # of the monomials' Fischer norm 1: below this a direction belongs to a higher degree
 
@@ -35,7 +36,10 @@ class Degrees(NamedTuple):
     def of(cls, record: dict[str, Any]) -> Degrees:
         """From `_asdict`, also where tuples have become lists."""
         monomials = (tuple(tuple(row) for row in block) for block in record["monomials"])
-        return cls(tuple(monomials), float(record["reach"]))
+        reach = record["reach"]
+        if isinstance(reach, list):  # of directions of a row's own
+            return cls(tuple(monomials), rows(torch.tensor(reach, dtype=torch.float64, device="cpu")))
+        return cls(tuple(monomials), float(reach))
 
     def sizes(self) -> tuple[int, ...]:
         """Number of functionals of each degree."""

@@ -135,7 +135,8 @@ def choice(call: str, name: str, value: object, allowed: Collection[object]) -> 
 
 
 def vector(call: str, name: str, value: object, length: int | None = None) -> list[float]:
-    """A sequence of finite numbers, of a stated length where one is stated."""
+    """A sequence of finite numbers, or a tensor of one dimension, of a stated length where one is stated."""
+    value = numbers_of(call, name, value)
     if isinstance(value, str) or not isinstance(value, Sequence):
         raise fail(call, name, "must be a list of numbers", value)
     numbers = [v for v in value if isinstance(v, int | float) and not isinstance(v, bool)]

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ...lanes.row_objects import OfRows
 from ...numerics.checks import non_negative, one_or_each, positive
 from ...numerics.linalg import row_jacobian
 from ...numerics.riccati import product
@@ -29,7 +30,7 @@ class Considered(NamedTuple):
     missed: Tensor  # (..., n) of every state, measurements of it that were missing
 
 
-class ConsiderFilter:
+class ConsiderFilter(metaclass=OfRows):
     """The Schmidt-Kalman filter of measured states y = x + noise around an estimate theta^ with covariance C:
 
         x^ += H d theta^,   x^-, F = step of x^ with theta^,   H- = F H + dt Y,   P- = F P F' + Q dt,

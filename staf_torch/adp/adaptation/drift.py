@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ...kernels import Kernel
+from ...lanes.row_objects import OfRows
 from ...numerics.checks import fail, non_negative, positive_real, real, trailing
 from ...numerics.linalg import row_jacobian
 from ...numerics.pivoted_cholesky import newton_basis
@@ -36,7 +37,7 @@ class DriftEstimate(NamedTuple):
     covariance: Tensor  # (..., M n, M n) of the weights of every row, in units of ``deviation``^2
 
 
-class StreamDrift:
+class StreamDrift(metaclass=OfRows):
     """d(x) in x' = h(x) + d(x) + g(x) u as a stream of StaF models, where nothing of d is known but that it
     vanishes at the plant's equilibrium x_s:
 

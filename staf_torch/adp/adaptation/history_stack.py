@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ...lanes import repeat
+from ...lanes.row_objects import OfRows
 from ...numerics.checks import integer, non_negative, positive_real, real
 from ..problem.cost import matvec
 from .windows import Equation
@@ -31,7 +32,7 @@ class Stack(NamedTuple):
     missed: Tensor  # (...) equations with a row that was not finite
 
 
-class HistoryStack:
+class HistoryStack(metaclass=OfRows):
     """Keep the N equations S theta = z whose sum of S'S has the largest least eigenvalue.
 
     Empty places are filled with what differs enough from the equation before. Then an equation takes the
@@ -207,7 +208,7 @@ def _finite(gram: Tensor) -> Tensor:
     return torch.where(torch.isfinite(gram), gram, 0.0)
 
 
-class ConcurrentGradient:
+class ConcurrentGradient(metaclass=OfRows):
     """theta' = Gam (push + gain sum_j S_j' (z_j - S_j theta)) over a history stack, the step implicit:
 
         theta+ = (I + h Gam gain sum_j S_j'S_j)^-1 (theta + h Gam (push + gain sum_j S_j'z_j)).
@@ -266,7 +267,7 @@ class Identified(NamedTuple):
         return self.stack.z.squeeze(-2)
 
 
-class ConcurrentLearning:
+class ConcurrentLearning(metaclass=OfRows):
     """theta' = gain (s (y - theta's)' + sum_j s_j (y_j - theta's_j)'), with y = x' - g u measured.
 
     A `HistoryStack` of N pairs (s_j, y_j) makes theta converge without persistent excitation once

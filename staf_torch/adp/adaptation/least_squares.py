@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ...lanes.row_objects import OfRows
 from ...numerics.checks import non_negative, one_or_each, positive, positive_real, real, vector
 from ...numerics.riccati import measured
 from .windows import Equation
@@ -27,7 +28,7 @@ class Estimate(NamedTuple):
         return {"theta": self.theta, "theta_covariance": self.covariance, "resets": self.resets}
 
 
-class LeastSquares:
+class LeastSquares(metaclass=OfRows):
     """theta^ of the equations S theta = z + noise by recursive least squares, one row of S after the other:
 
         k = P s / (s'P s + r),   theta^ += k (z - s'theta^),   P = (I - k s') P (I - k s')' + r k k',

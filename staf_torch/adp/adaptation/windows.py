@@ -10,6 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ...lanes.row_objects import OfRows
 from ...numerics.checks import choice, fail, non_negative, positive_real, real
 from .parametric import ParametricPlant
 
@@ -47,7 +48,7 @@ class Window(NamedTuple):
     missed: Tensor  # (...) measurements that were missing so far
 
 
-class Windows(abc.ABC):
+class Windows(metaclass=OfRows):
     """Equations S theta = z, one a window of time.
 
     A measurement with an entry that is NaN is missing: it ends its window without an equation, the next one

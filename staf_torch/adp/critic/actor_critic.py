@@ -9,6 +9,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
+from ...lanes.row_numbers import RowNumbers
 from ...numerics.checks import copied, fail, positive, trailing, vector
 from ...systems import ControlAffineSystem
 from ..loop.controller import Controller
@@ -108,7 +109,8 @@ class ActorCritic(Controller):
         return {"actor_weights": carried.actor, "critic_weights": carried.critic}
 
     def numbers(self) -> dict[str, float | Tensor]:
-        return dict(vars(self.law.gains))
+        gains = vars(self.law.gains)  # those of `rows` are columns by themselves
+        return {name: value for name, value in gains.items() if not isinstance(value, RowNumbers)}
 
     def with_numbers(self, numbers: Mapping[str, Any]) -> Self:
         other = copied(self)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import itertools
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -11,11 +12,12 @@ from torch import Tensor, nn
 from ...approximation.basis import StaFBasis
 from ...centers import StateRadius
 from ...kernels import AnchoredKernel, ExponentialKernel
+from ...lanes.row_objects import OfRows
 from ...numerics.checks import choice, flag, integer, positive_real
 from ...numerics.forward_mode import jacobian
 
 
-class ValueBasis(nn.Module, abc.ABC):
+class ValueBasis(nn.Module, metaclass=OfRows):
     """V^(y) = W's(y; x): M functions, whose centers may stand around a state x.
 
     Example:
@@ -31,6 +33,7 @@ class ValueBasis(nn.Module, abc.ABC):
         follows_state: whether the functions stand around the state x; those of a global basis ignore x.
     """
 
+    rowwise: ClassVar = {"forward": (1, 1), "gradient": (1, 1), "value": (1, 1)}
     count: int
     dim: int
     follows_state: bool = False

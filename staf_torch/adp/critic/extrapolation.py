@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import abc
 import itertools
+from typing import ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from ...centers import ConstantRadius, Radius
+from ...lanes.row_objects import OfRows
 from ...numerics.checks import choice, integer
 
 
-class Extrapolation(nn.Module, abc.ABC):
+class Extrapolation(nn.Module, metaclass=OfRows):
     """N points y_i = x + b(x) z_i of the box [-b, b]^n around the state, with weights that sum to 1.
 
     Around the ``origin`` they are y_i = b z_i, wherever the state is. That is what a global basis needs: its
@@ -37,6 +39,7 @@ class Extrapolation(nn.Module, abc.ABC):
         draws: random points that a step needs.
     """
 
+    rowwise: ClassVar = {"forward": (1, 2)}
     count: int
     draws: int = 0
     weights: Tensor

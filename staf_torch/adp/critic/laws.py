@@ -11,27 +11,28 @@ import torch
 from torch import Tensor
 
 from ...lanes import traced_as
+from ...lanes.row_objects import OfRows
 from ...lanes.trace import factorisations
-from ...numerics.checks import fail, number, positive_real
+from ...numerics.checks import fail, non_negative, positive_real
 from ..problem.cost import matvec
 from .bellman import BellmanTerms, bellman_error
 
 _UNROLLED = 12  # unknowns up to which elimination by whole-batch operations is the faster one
 
 Gain = float | Tensor
-"""A number, or (B, 1)."""
+"""A number, of `rows` one a row, or (B, 1)."""
 
 
 def over_matrices(gain: Gain) -> Gain:
     """A gain as a factor of (B, M, M)."""
-    return gain.unsqueeze(-1) if isinstance(gain, Tensor) else gain
+    return gain.unsqueeze(-1) if isinstance(gain, Tensor) and gain.dim() else gain
 
 
 @dataclasses.dataclass(frozen=True)
-class Gains:
+class Gains(metaclass=OfRows):
     """Gains of the actor-critic laws; the defaults are the published ones of the two-state example.
 
-    Each is a number, or a tensor (B, 1) with one a trajectory.
+    Each is a number, by `staf_torch.rows` one a trajectory, or a tensor (B, 1) of these.
 
     Example:
         >>> adp.Gains(actor=15.0).actor
@@ -66,11 +67,9 @@ class Gains:
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
-            value = number("Gains", field.name, getattr(self, field.name))
-            if isinstance(value, Tensor) and (value.dim() != 2 or value.shape[-1] != 1):
+            value = non_negative("Gains", field.name, getattr(self, field.name))
+            if value.dim() and (value.dim() != 2 or value.shape[-1] != 1):
                 raise fail("Gains", field.name, "must be a number or of the shape (B, 1)", tuple(value.shape))
-            if bool((torch.as_tensor(value, device=getattr(value, "device", "cpu")) < 0).any()):
-                raise fail("Gains", field.name, "must not be negative", value)
 
 
 class Weights(NamedTuple):
@@ -90,7 +89,7 @@ class BellmanSums(NamedTuple):
     actor_force: Tensor  # sum a_j G_j Wa w_j'Wc / (4 rho_j), (..., M)
 
 
-class ActorCriticLaw(abc.ABC):
+class ActorCriticLaw(metaclass=OfRows):
     """Law by which the weights move, given the Bellman terms.
 
     Example:

@@ -10,8 +10,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ...lanes.row_objects import OfRows
 from ...numerics.angles import periods_of, wrap_each
-from ...numerics.checks import fail, non_negative, one_or_each, positive, real, trailing, vector
+from ...numerics.checks import fail, non_negative, one_or_each, positive, trailing, vector
 from ...numerics.linalg import row_jacobian
 from ...numerics.riccati import measured, product
 from ...numerics.row_checks import check_rows
@@ -30,7 +31,7 @@ class Belief(NamedTuple):
     missed: Tensor | None = None  # (..., q) measurements of every output that were missing, where counted
 
 
-class KalmanFilter(abc.ABC):
+class KalmanFilter(metaclass=OfRows):
     """The state from outputs y = h(x) + noise, with the model of the plant between measurements.
 
     An entry of y that is NaN is missing: the other outputs are used, without any the model alone goes on, and
@@ -59,16 +60,17 @@ class KalmanFilter(abc.ABC):
         periodic: Sequence[int] = (),
     ) -> None:
         name, n = type(self).__name__, model._size()
-        if not noise or not all(real(name, "noise", s) > 0 for s in noise):
+        noises = vector(name, "noise", noise)
+        if not noises or min(noises) <= 0:
             raise fail(name, "noise", "must be positive numbers, one an output", noise)
         self.model, self.output = model, output
         self._held: dict[float, Holding] = {}  # of every period
-        self.noise = torch.tensor(noise, dtype=torch.float64, device="cpu")
+        self.noise = torch.tensor(noises, dtype=torch.float64, device="cpu")
         self.process = non_negative(name, "process", one_or_each(name, "process", process, n))
         seen = output(torch.zeros(1, n, dtype=torch.float64, device="cpu"))
-        if tuple(seen.shape) != (1, len(noise)):
-            raise fail(name, "output", f"must map (1, {n}) to (1, {len(noise)})", tuple(seen.shape))
-        q = len(noise)
+        if tuple(seen.shape) != (1, len(noises)):
+            raise fail(name, "output", f"must map (1, {n}) to (1, {len(noises)})", tuple(seen.shape))
+        q = len(noises)
         check_rows(f"{name}(output=...)", output, [torch.zeros(n, dtype=torch.float64, device="cpu")], (q,))
         if not set(periodic) <= set(range(-q, q)):
             raise fail(name, "periodic", f"must be places of {q} outputs", list(periodic))

@@ -381,7 +381,7 @@ def _run(
     seeds: Sequence[int],
     progress: Callable[[int], None],
 ) -> tuple[LoopResult, LoopState]:
-    state = loop.init(x0)
+    state: LoopState = over_rows(loop.init, x0)
     pieces: list[list[Tensor]] = []
     draws, done, numbers = loop.controller.draws, 0, row_numbers(loop)
     generators = [torch.Generator().manual_seed(seed) for seed in (seeds if draws else ())]
