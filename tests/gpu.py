@@ -92,8 +92,7 @@ CASES: dict[str, Callable[[int, torch.dtype], Case]] = {
 
 def compare(name: str, program: lanes.Program, carry: Any, now: Any, row: Any, bound: float) -> int:
     """Print how far the kernel is from plain torch on the CPU, and its time; 1 where beyond the bound."""
-    kernel = lanes.cuda.CudaKernel(program, carry, now, row)
-    wanted = program.definition(carry, now, row)
+    wanted, kernel = program.definition(carry, now, row), program
     inputs = [lanes.tree.moved(tree, "cuda") for tree in (carry, now, row)]
     found = kernel(*inputs)
     torch.cuda.synchronize()

@@ -1,9 +1,9 @@
 """Row programs: torch functions of one row, compiled with a row in every vector lane."""
 
+from . import device as device
 from .compiled_methods import compiled as compiled
 from .compiled_methods import compiling as compiling
 from .compiled_methods import ready as ready
-from .emit import cuda as cuda
 from .loops import each as each
 from .loops import reduce as reduce
 from .loops import repeat as repeat
@@ -15,5 +15,16 @@ from .row_objects import rows as rows
 from .shared_programs import shared_program as shared_program
 from .tree import Shared as Shared
 
-__all__ = ["Program", "Shared", "compiled", "compiling", "each", "ready", "reduce", "repeat", "scan"]
+__all__ = [
+    "Program",
+    "Shared",
+    "compiled",
+    "compiling",
+    "device",
+    "each",
+    "ready",
+    "reduce",
+    "repeat",
+    "scan",
+]
 __all__ += ["rows", "shared_program", "traced_as", "where_rows"]

@@ -33,7 +33,7 @@ import torch
 from torch import Tensor
 
 from .contents import is_users
-from .emit.cpp import Text
+from .emit.tables import Text
 from .row_numbers import RowNumbers
 from .trace.captured_tensors import Recipe
 from .trace.captured_tensors import tensors as tensors_of
@@ -152,7 +152,7 @@ class _TraceWriter(pickle.Pickler):
             return "given", self._places[id(value)]
         if id(value) in self._made:
             return "made", self._made[id(value)]
-        return "value", value.detach().numpy().copy()
+        return "value", value.detach().cpu().numpy().copy(), str(value.device)
 
 
 class _TraceReader(pickle.Unpickler):
@@ -189,7 +189,7 @@ class _TraceReader(pickle.Unpickler):
             return self._given[value]
         if kind == "made":  # stands for what the operation will make: its identity alone matters
             return self._made.setdefault(value, torch.empty(0, dtype=torch.float64, device="cpu"))
-        return torch.from_numpy(value)
+        return torch.from_numpy(value).to(name[2])
 
 
 def cache() -> Path:
@@ -315,7 +315,7 @@ def prune(folder: Path, *, now: float | None = None, largest: int = LARGEST) -> 
     for path in folder.iterdir():
         with contextlib.suppress(OSError):  # deleted by another process
             state = path.stat()
-            if path.suffix == ".so" or path.name.startswith(("trace-", _SCRATCH)):
+            if path.suffix in (".so", ".cubin") or path.name.startswith(("trace-", _SCRATCH)):
                 found.append((state.st_mtime, state.st_size, path))
     kept = sum(size for _, size, _ in found)
     for last_use, size, path in sorted(found):

@@ -50,8 +50,8 @@ def fresh(like: Tensor, *shape: int) -> Tensor:
     return torch.frombuffer(memory, dtype=like.dtype, count=size // like.element_size()).view(shape)
 
 
-Form = tuple[torch.Size, tuple[int, ...], torch.dtype, bool]
-"""Shape, strides and dtype of an input, and whether all rows share it."""
+Form = tuple[torch.Size, tuple[int, ...], torch.dtype, Hashable]
+"""Shape, strides and dtype of an input, whether all rows share it, and its device unless it is the CPU."""
 
 
 class _Slot(ctypes.Structure):
@@ -77,11 +77,17 @@ class Compiled(NamedTuple):
     rows: tuple[RowNumbers, ...] = ()  # whose columns follow what a row has once
 
 
-def ordinary(leaves: Sequence[Any]) -> bool:
-    """Return whether tensors are plain ones on the CPU of which nobody wants a derivative.
+Where = bool | torch.device
+"""What runs compiled code: True for the processor's lanes, a device for its kernels, False for neither."""
+processor: Where = True  # of tensors on the CPU; `device.host` has it be a device
 
-    All that is given to compiled code passes here: dense, of no subclass, without a pending sign. Under a
-    tracer, a transform of torch.func or another mode the operations themselves are wanted.
+
+def ordinary(leaves: Sequence[Any]) -> Where:
+    """Return where plain tensors are of which nobody wants a derivative, False of others.
+
+    All that is given to compiled code passes here: dense, of no subclass, without a pending sign, on the CPU
+    or one CUDA device. Under a tracer, a transform of torch.func or another mode the operations themselves
+    are wanted.
     """
     if (
         torch._C._functorch.peek_interpreter_stack() is not None
@@ -92,14 +98,24 @@ def ordinary(leaves: Sequence[Any]) -> bool:
     recorded = torch.is_grad_enabled()
     for leaf in leaves:
         tensor = plain(leaf)
-        if (
-            type(tensor) not in _TENSORS
-            or not tensor.is_cpu
-            or (recorded and tensor.requires_grad)
-            or tensor.is_neg()
-        ):
+        if type(tensor) not in _TENSORS or (recorded and tensor.requires_grad) or tensor.is_neg():
             return False
-    return True
+        if not tensor.is_cpu:
+            return _one_device(leaves)
+    return processor
+
+
+def _one_device(leaves: Sequence[Any]) -> Where:
+    """Return the CUDA device where plain tensors are, single numbers aside; False where there is none."""
+    found, recorded = set[torch.device](), torch.is_grad_enabled()
+    for leaf in leaves:
+        tensor = plain(leaf)
+        if type(tensor) not in _TENSORS or (recorded and tensor.requires_grad) or tensor.is_neg():
+            return False
+        if tensor.dim() or not tensor.is_cpu:
+            found.add(tensor.device)
+    where = found.pop()
+    return where if not found and where.type == "cuda" else False
 
 
 _TENSORS = (Tensor, torch.nn.Parameter)
@@ -108,7 +124,9 @@ _TENSORS = (Tensor, torch.nn.Parameter)
 def form(leaf: Any) -> Form:
     """Return what a plan must know about an input."""
     tensor = plain(leaf)
-    return tensor.shape, tensor.stride(), tensor.dtype, type(leaf) is Shared
+    shared = type(leaf) is Shared
+    place = shared if tensor.is_cpu else (shared, tensor.device)
+    return tensor.shape, tensor.stride(), tensor.dtype, place
 
 
 class PlannedCall:
@@ -148,9 +166,14 @@ class PlannedCall:
         ]
         self.direct = not self._copied and not any(type(leaf) is Shared for leaf in leaves)
         recorded = -(-steps // every)
-        ends = [((rows, *s), (1, *_inner(s, rows)), s.numel(), 0) for s, _ in compiled.carry]
+        ends = [((rows, *s), (1, *inner_strides(s, rows)), s.numel(), 0) for s, _ in compiled.carry]
         histories = [
-            ((rows, recorded, *s), (1, s.numel() * rows, *_inner(s, rows)), s.numel(), s.numel() * rows)
+            (
+                (rows, recorded, *s),
+                (1, s.numel() * rows, *inner_strides(s, rows)),
+                s.numel(),
+                s.numel() * rows,
+            )
             for s, _ in compiled.outputs
         ]
         slots += [_Slot(1, time, rows, entries) for _, _, entries, time in (*ends, *histories)]
@@ -174,9 +197,9 @@ class PlannedCall:
         lead = 1 + timed - shared
         inner = tensor.shape[lead:]
         strides = tensor.stride()
-        if tensor.dtype != self._compiled.real or not _even(inner, strides[lead:]):
+        if tensor.dtype != self._compiled.real or not entries_lie_evenly(inner, strides[lead:]):
             self._copied.append(k)
-            strides = _inner(tensor.shape, 1)
+            strides = inner_strides(tensor.shape, 1)
         row = 0 if shared else strides[0]
         longer = [stride for size, stride in zip(inner, strides[lead:], strict=True) if size > 1]
         return _Slot(row, strides[lead - 1] if timed else 0, longer[-1] if longer else 1, inner.numel())
@@ -216,7 +239,7 @@ class PlannedCall:
 _address = Tensor.data_ptr
 
 
-def _inner(shape: Sequence[int], unit: int) -> tuple[int, ...]:
+def inner_strides(shape: Sequence[int], unit: int) -> tuple[int, ...]:
     """The strides of contiguous entries that lie ``unit`` numbers apart."""
     strides = []
     for size in reversed(shape):
@@ -225,7 +248,7 @@ def _inner(shape: Sequence[int], unit: int) -> tuple[int, ...]:
     return tuple(reversed(strides))
 
 
-def _even(shape: Sequence[int], strides: Sequence[int]) -> bool:
+def entries_lie_evenly(shape: Sequence[int], strides: Sequence[int]) -> bool:
     """Return whether entries in their order lie equally far apart."""
     longer = [(size, stride) for size, stride in zip(shape, strides, strict=True) if size > 1]
     return all(a[1] == b[0] * b[1] for a, b in itertools.pairwise(longer))
@@ -348,8 +371,8 @@ class Given(NamedTuple):
                 parts.append((tensor.shape[skip - shared :], tensor.dtype, shared))
         return tuple(parts), tuple(self.structures.values())
 
-    def ordinary(self) -> bool:
-        """Return whether all tensors are ordinary ones on the CPU of which nobody wants a derivative."""
+    def ordinary(self) -> Where:
+        """Return where all tensors are, as `ordinary`; False where there are no rows or times."""
         if self.rows == 0 or self.times == 0:
             return False
         return ordinary((*self.carry, *self.now, *self.row))

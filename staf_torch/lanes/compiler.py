@@ -56,8 +56,8 @@ def compiled(source: Path, *definitions: str) -> Callable[..., None] | None:
     try:
         text = source.read_text(encoding="utf-8")
         with _one_at_a_time:
-            library = ctypes.CDLL(str(_library(name, text, options, source.parent)))
-        call: Callable[..., None] = library[f"staf_{name}"]
+            built = ctypes.CDLL(str(library(name, text, options, source.parent)))
+        call: Callable[..., None] = built[f"staf_{name}"]
         call.restype = None  # type: ignore[attr-defined]
     except Exception as error:  # whatever a machine lacks, the reference computes the same
         _say(name, " ".join(str(error).split())[:300])
@@ -77,15 +77,21 @@ def machine_code(text: str) -> Callable[..., None]:
     with _one_at_a_time:
         found = _programs.get(text)
         if found is None:
-            found = ctypes.CDLL(str(_library("lanes", text, _OF_PROGRAMS, _FOLDER))).lanes_run
+            found = ctypes.CDLL(str(library("lanes", text, _OF_PROGRAMS, _FOLDER))).lanes_run
             found.restype = None
             found.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)
             _programs[text] = found
         return found
 
 
-def _library(name: str, text: str, options: tuple[str, ...], folder: Path) -> Path:
+def library(name: str, text: str, options: tuple[str, ...], folder: Path) -> Path:
     """Return the path of a shared object, built if it is not in the cache.
+
+    Args:
+        name: with which that of the file begins.
+        text: C++.
+        options: of the compiler.
+        folder: where headers are looked for, beside that of this file.
 
     Its name says what it is made of, and then by which compiler. Where there is no compiler, the machine code
     of any other serves, as in a container to which a cache was copied.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Hashable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -12,7 +11,7 @@ from torch import Tensor
 from ..signs import Sign
 from . import cache
 from .cache import Trace
-from .call import Compiled, Given, PlannedCall, form, ordinary, whole
+from .call import Compiled, Given, form, ordinary
 from .compiler import machine_code
 from .contents import Contents, Derived
 from .emit.c import Names, c_text
@@ -21,14 +20,14 @@ from .locks import Mutex
 from .loops import scan, tracing_now
 from .one_thread import ENTRIES, alone
 from .opaque import opaque
+from .prepared import Prepared, say
 from .row_independence import doubt, undrawn
 from .row_numbers import RowNumbers, over_rows, points_of_rows
+from .texts import Form, kernel, written
 from .trace.step import Step, trace
 from .trace.tracer import NotLoweredError
 from .tree import Shared, Tree, flatten, labels, plain, unflatten
 
-_log = logging.getLogger(__name__)
-_said: set[tuple[str, str]] = set()  # what has been logged
 _FEW = 8  # rows that one vector holds
 _LONGEST = 20_000  # lines that a compiler is asked to take: half a minute
 _PREPARED = 64  # calls of other shapes that a program remembers
@@ -211,7 +210,7 @@ class Program(Derived):
         leaves, structure = flatten((row, now, carry))
         prepared = self._prepared.get((structure, tuple(map(form, leaves)), steps, 1))
         if prepared is not None and prepared.plan is not None:  # it has served such ones
-            return ordinary(leaves)
+            return bool(ordinary(leaves))
         return self.find(Given.of(carry, now, row, steps)) is not None
 
     def text(self, carry: Tree, now: Tree = (), row: Tree = (), *, steps: int | None = None) -> str:
@@ -222,6 +221,20 @@ class Program(Derived):
         """
         traced = trace(self.step, Given.of(carry, now, row, steps))
         return emit(*traced.program, self.copies).source
+
+    def cuda_source(self, carry: Tree, now: Tree = (), row: Tree = (), *, steps: int | None = None) -> str:
+        """The CUDA C of the program for such inputs, a thread a row, as it runs on a device.
+
+        Its numbers are those of a table that comes with a call.
+
+        Args:
+            carry, now, row, steps: as in a call; only shapes and dtypes matter.
+
+        Raises:
+            NotLoweredError: if there is none.
+        """
+        given = Given.of(carry, now, row, steps)
+        return kernel(trace(self.step, given), given).source
 
     def c_source(
         self,
@@ -264,16 +277,17 @@ class Program(Derived):
 
     def find(self, given: Given) -> Compiled | None:
         """The compiled program for such inputs, None where there is none."""
-        if not self.compile or not given.ordinary():
+        where = given.ordinary()
+        if not self.compile or not where:
             return None
-        copies = self.copies or int(given.rows <= _FEW)
-        key = given.key(), copies
+        form = (self.copies or int(given.rows <= _FEW)) if where is True else where
+        key = given.key(), form
         with (
             self._lock,
-            torch.device("cpu"),
+            torch.device("cpu" if where is True else where),
         ):  # what the step makes is where its inputs are, not on a default device
             if key not in self._compiled:
-                self._compiled[key] = self._again(key) or self._build(given, copies)
+                self._compiled[key] = self._again(key) or self._build(given, form)
             built = self._compiled[key]
             return None if built is None or not self._alone(given) else built.compiled
 
@@ -286,7 +300,7 @@ class Program(Derived):
             if self._of_users:
                 self._refused = self._refused or doubt(self.step, given)
             if self._refused is not None:
-                _say(self.name, f"its step {self._refused}")
+                say(self.name, f"its step {self._refused}")
         return self._refused is None
 
     def differentiated(self) -> bool:
@@ -321,19 +335,20 @@ class Program(Derived):
         compiled = built.compiled._replace(table=table, rows=rows)
         return built._replace(compiled=compiled)
 
-    def _build(self, given: Given, copies: int) -> _Built | None:
+    def _build(self, given: Given, form: Form) -> _Built | None:
         if self._read is None and self._watched:
             self._read = Contents(self.step)
         try:
             with undrawn(), Sign(f"compiling {self.name}"):
-                made = self._known(given, copies)
+                made = self._known(given, form)
             if (lines := made.text.source.count("\n")) > _LONGEST:
                 raise NotLoweredError(f"the program is {lines} lines long, which take a compiler minutes")
             if not self._alone(given):  # before a compiler is asked for what would not be used
                 return None
-            call = machine_code(made.text.source)
+            source = made.text.source
+            call: Any = machine_code(source) if isinstance(form, int) else source
         except (NotLoweredError, OSError) as error:
-            _say(self.name, str(error), "no build" if isinstance(error, OSError) else None)
+            say(self.name, str(error), "no build" if isinstance(error, OSError) else None)
             return None
         if self._read is not None:
             self._read.warn(self.name)
@@ -341,16 +356,16 @@ class Program(Derived):
         shapes = tuple((leaf.shape[1:], leaf.dtype) for leaf in given.carry)
         return _Built(Compiled(call, table, made.real, shapes, made.outputs, made.structure, made.rows), made)
 
-    def _known(self, given: Given, copies: int) -> Trace:
+    def _known(self, given: Given, form: Form) -> Trace:
         """Return the trace of the step with a single row, from the cache where it has been traced before."""
         shapes = None if self._described is None else Contents(given.key()).signature()
         if self._described is None or shapes is None or not cache.unpatched():
-            return _written(self.step, given, copies)
+            return written(self.step, given, form)
         step, tensors = self._described
-        path = cache.place(step, shapes, copies)
+        path = cache.place(step, shapes, form)
         found = cache.load(path, tensors)
         if found is None:
-            found = _written(self.step, given, copies)
+            found = written(self.step, given, form)
             cache.save(path, found, tensors)
         return found
 
@@ -361,83 +376,6 @@ def _loops_over(now: Tree) -> bool:
     return bool(leaves) and not any(isinstance(leaf, Shared) for leaf in leaves)
 
 
-def _say(name: str, reason: str, kind: str | None = None) -> None:
-    """Log why a program runs in plain torch, once for a reason or a kind of reasons."""
-    reason = " ".join(reason.split())[:600]
-    told = name, reason if kind is None else kind
-    if told not in _said:
-        _said.add(told)
-        _log.warning("%s runs in plain torch, slower: %s", name, reason)
-
-
-def _written(step: Step, given: Given, copies: int) -> Trace:
-    real = given.real
-    try:
-        traced = trace(step, given)
-        text = emit(*traced.program, copies)
-    except NotLoweredError:
-        if real == torch.float64:
-            raise
-        # float64 within a program of float32: all of it in double, rounded where it ends.
-        real = torch.float64
-        traced = trace(step, given, widened=True)
-        text = emit(*traced.program, copies)
-    return Trace(text, traced.recipe, real, traced.outputs, traced.structure, traced.rows)
-
-
 class _Built(NamedTuple):
     compiled: Compiled
     trace: Trace
-
-
-class Prepared:
-    """A call of a program for inputs of fixed shapes, strides and dtypes; `Program.prepare` makes one.
-
-    Called as the program is, without ``steps`` and ``every``. Inputs of other forms go to the program.
-
-    Attributes:
-        plan: of the compiled call, once there was one; None before, and where the definition runs.
-    """
-
-    def __init__(self, program: Program, given: Given, every: int) -> None:
-        self._program, self._steps, self._every = program, given.times, whole("every", every, 1)
-        leaves, self._structure = flatten(given.trees())
-        self._forms = tuple(map(form, leaves))
-        self._carries, self._carry = len(given.carry), given.structures["carry"]
-        self.plan: PlannedCall | None = None
-        self._refused = given.rows == 0 or given.times == 0
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the parts of a copy, which finds its plan by itself."""
-        return {**vars(self), "plan": None}
-
-    @opaque
-    def __call__(self, carry: Tree, now: Tree = (), row: Tree = ()) -> tuple[Tree, Tree]:
-        """The carry after the last step, and the outputs."""
-        leaves, structure = flatten((row, now, carry))
-        if structure != self._structure or tuple(map(form, leaves)) != self._forms:
-            return self._program(carry, now, row, steps=self._steps, every=self._every)
-        return self.run(leaves, carry, now, row)
-
-    def run(self, leaves: Sequence[Any], carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
-        """Run with inputs that are known to fit."""
-        if self._refused or not ordinary(leaves) or self._program.differentiated():
-            return self._program.definition(carry, now, row, steps=self._steps, every=self._every)
-        if self.plan is None:
-            given = Given.of(carry, now, row, self._steps)
-            compiled = self._program.find(given)
-            if compiled is None:
-                self._refused = True
-                return self.run(leaves, carry, now, row)
-            times = [False] * len(given.row) + [True] * len(given.now) + [False] * len(given.carry)
-            self.plan = PlannedCall(
-                compiled,
-                leaves,
-                times,
-                rows=given.rows,
-                steps=given.times,
-                every=self._every,
-                once=len(given.row),
-            )
-        rooms = iter(self.plan(leaves))
-        return unflatten(self._carry, rooms), unflatten(self.plan.structure, rooms)

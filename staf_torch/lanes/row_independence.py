@@ -87,9 +87,12 @@ def generators() -> Callable[[], None]:
     """Return the function that puts the states of all common random numbers back to what they are now."""
     common = np.random.get_state()  # noqa: NPY002 - a user's code draws from it
     states = torch.get_rng_state(), common, random.getstate()
+    cards = torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else []
 
     def put_back() -> None:
         torch.set_rng_state(states[0])
+        if cards:
+            torch.cuda.set_rng_state_all(cards)
         np.random.set_state(states[1])  # noqa: NPY002
         random.setstate(states[2])
 
@@ -102,7 +105,7 @@ def _farthest(given: Given) -> int:
     for leaf in (*given.carry, *given.now, *given.row):
         if isinstance(leaf, Tensor) and leaf.numel():
             at = leaf[:, 0] if any(leaf is other for other in given.now) else leaf
-            numbers = at.detach().double().reshape(given.rows, -1).nan_to_num(0.0, 0.0, 0.0)
+            numbers = at.detach().cpu().double().reshape(given.rows, -1).nan_to_num(0.0, 0.0, 0.0)
             distance += (numbers - numbers[:1]).abs().sum(-1)
     return int(distance.argmax()) if given.rows > 1 else 0
 

@@ -146,12 +146,8 @@ TEXTS: dict[str, Callable[[], str]] = {
     "C++ of many entries": lambda: lanes.Program(
         lambda x, u, _: (torch.where(x > 1, 0.5 * x.roll(1, -1), x) + u.unsqueeze(-1), x.sum(-1)), copies=2
     ).text(torch.ones(1, 65), torch.ones(1, 1)),
-    "CUDA of a step": lambda: (
-        lanes.cuda.CudaKernel(
-            lanes.Program(moved),
-            *({"x": torch.ones(1, 2)}, torch.ones(1, 1, 2), {"gain": lanes.Shared(torch.ones(1))}),
-            compile=lambda source, name: lambda *_: None,
-        ).source
+    "CUDA of a step": lambda: lanes.Program(moved).cuda_source(
+        {"x": torch.ones(1, 2)}, torch.ones(1, 1, 2), {"gain": lanes.Shared(torch.ones(1))}
     ),
 }
 
@@ -163,44 +159,18 @@ def test_the_text_of_a_small_program_is_the_recorded(name: str, record: Record) 
         record({"torch": VERSION, "text": TEXTS[name]()})
 
 
-@needs_gcc
 @pytest.mark.parametrize(("dtype", "bound"), [(torch.float64, 1e-12)])
-def test_cuda_text_on_a_host_is_the_definition(dtype: torch.dtype, bound: float, tmp_path: Path) -> None:
+def test_a_kernel_on_the_host_is_the_definition(dtype: torch.dtype, bound: float) -> None:
     """No device is needed: g++ compiles the kernel, a loop is the grid."""
     carry, u, row = given(37, dtype)
     program = lanes.Program(flow)
-    call = lanes.cuda.CudaKernel(program, carry, u, row, compile=host_compiler(tmp_path))
     for every in (1, 4):
-        end, out = call(carry, u, row, every=every)
+        with lanes.device.host():
+            end, out = program(carry, u, row, every=every)
         wanted, outs = program.definition(carry, u, row, every=every)
         for one, other in zip((*end.values(), *out), (*wanted.values(), *outs), strict=True):
             assert one.dtype == other.dtype
             torch.testing.assert_close(one, other, rtol=bound, atol=bound)
-
-
-def host_compiler(folder: Path) -> Callable[[str, str], Callable[..., None]]:
-    """Compile a kernel with g++: a grid of blocks as two loops."""
-
-    def compile(source: str, name: str) -> Callable[..., None]:
-        _, arguments = source[: source.index(")\n{")].split(f"{name}(")
-        names = [part.split()[-1].lstrip("*") for part in arguments.split(",")]
-        shim = "#include <cmath>\nusing namespace std;\n#define __global__\n"
-        shim += "struct { int x; } blockIdx, blockDim, threadIdx;\n"
-        launch = f'extern "C" void launch(int grid, int block, {arguments}) {{ blockDim.x = block;\n'
-        launch += "for (blockIdx.x = 0; blockIdx.x < grid; ++blockIdx.x)\n"
-        launch += "for (threadIdx.x = 0; threadIdx.x < block; ++threadIdx.x) "
-        launch += f"{name}({', '.join(names)}); }}\n"
-        library = built(
-            shim + source + launch, folder, f"{name}.cpp", ("g++", "-O0", "-w", "-shared", "-fPIC")
-        )
-
-        def run(grid: Any, block: Any, args: Any) -> None:
-            given = [pointer(a) if isinstance(a, Tensor) else ctypes.c_int(a) for a in args]
-            library.launch(grid[0], block[0], *given)
-
-        return run
-
-    return compile
 
 
 # No step reads a tensor back to the host: on the meta device, which has no numbers, that would raise.

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 import torch
-from test_c_and_cuda import STRICT, built, host_compiler, needs_gcc, pointer
+from test_c_and_cuda import STRICT, built, needs_gcc, pointer
 from torch import Tensor
 
 from staf_torch import lanes
@@ -122,10 +122,11 @@ def test_a_program_of_both_dtypes_rounds_as_its_definition(seed: int) -> None:
     check(program(*inputs), program.definition(*inputs))
 
 
-def test_cuda_text_of_both_dtypes_rounds_as_its_definition(tmp_path: Path) -> None:
+def test_a_kernel_of_both_dtypes_rounds_as_its_definition() -> None:
     program, inputs = lanes.Program(drawn(5)), given(5, 9)
-    kernel = lanes.cuda.CudaKernel(program, *inputs, compile=host_compiler(tmp_path))
-    check(kernel(*inputs), program.definition(*inputs))
+    with lanes.device.host():
+        assert program.compiles(*inputs)
+        check(program(*inputs), program.definition(*inputs))
 
 
 @needs_gcc

@@ -24,7 +24,9 @@ class Names(NamedTuple):
     outputs: Sequence[str]
 
 
-class _ScalarWriter(StatementWriter):
+class ScalarWriter(StatementWriter):
+    """What C and CUDA C have in common: every number is a variable of its own."""
+
     _infix: ClassVar[dict[str, str]] = StatementWriter._infix | {"and": "&&", "or": "||", "xor": "!="}
     _prefix: ClassVar[dict[str, str]] = StatementWriter._prefix | {"not": "!"}
 
@@ -101,7 +103,7 @@ class _ScalarWriter(StatementWriter):
         return [(n, self._starts["state"][graph.aux[n][0]] + graph.aux[n][1]) for n in read]
 
 
-class _CWriter(_ScalarWriter):
+class _CWriter(ScalarWriter):
     def _buffer(self, op: str, place: int, j: int, at: str = "0") -> str:
         slot, entry = self._slot(op, place)
         return f"{self._names[op][slot]}[{entry if at == '0' else f'{entry} + {at}' if entry else at}]"

@@ -11,15 +11,11 @@ import itertools
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from typing import ClassVar, NamedTuple
-
-import torch
-from torch import Tensor
+from typing import ClassVar
 
 from ..trace.graph import FLAG, NARROW, NOW, REAL, ROW, STEP, WHOLE, Graph
-from ..trace.tracer import LARGE
-from .schedule import Schedule, Sizes, ends_with, taken_over
-from .statements import StatementWriter
+from .schedule import Schedule, Sizes
+from .tables import TableWriter, Text
 
 _FEW = 400  # nodes of a program of which two vectors fit the registers and caches side by side
 _WRITTEN_OUT = 8  # entries of an output that are stored one by one
@@ -47,22 +43,6 @@ _FREE = frozenset(
     )
 ) | {"loop"}
 _MOST_WORK = 2**30  # so that products with it are numbers of 64 bits
-
-
-class Text(NamedTuple):
-    """A program and the numbers that it reads from a table, so that other numbers need no other program."""
-
-    source: str
-    table: list[float]
-    parameters: list[tuple[int, int]]  # places in the table, and the parameters of the graph that stand there
-
-    def numbers(self, parameters: Tensor, real: torch.dtype) -> Tensor:
-        """The table with these parameters, float64, in the program's dtype."""
-        table = torch.tensor(self.table or [0.0], dtype=torch.float64, device="cpu")
-        if self.parameters:
-            places, numbers = zip(*self.parameters, strict=True)
-            table[list(places)] = parameters[list(numbers)]
-        return table.to(real)
 
 
 def emit(graph: Graph, layout: Sizes, following: Sequence[int], outputs: Sequence[int], copies: int) -> Text:
@@ -111,17 +91,12 @@ def _copies(schedule: Schedule) -> int:
     return 2 if len(steps) < _FEW or shares else 1
 
 
-class _CppWriter(StatementWriter):
-    _infix: ClassVar[dict[str, str]] = StatementWriter._infix | {"and": "&", "or": "|", "xor": "^"}
-    _prefix: ClassVar[dict[str, str]] = StatementWriter._prefix | {"not": "~", "cast": ""}
+class _CppWriter(TableWriter):
+    _infix: ClassVar[dict[str, str]] = TableWriter._infix | {"and": "&", "or": "|", "xor": "^"}
+    _prefix: ClassVar[dict[str, str]] = TableWriter._prefix | {"not": "~", "cast": ""}
 
     def __init__(self, graph: Graph, schedule: Schedule, layout: Sizes, copies: int) -> None:
         super().__init__(graph, schedule, layout, {REAL: "V", NARROW: "V", WHOLE: "V", FLAG: "M"}, copies)
-        self._in_memory = {slot for slot, size in enumerate(layout.carries) if size > LARGE}
-        self._taken_over = taken_over(graph, schedule)
-        self._ends = dict[int, int]()  # slots that a map makes where they were
-        self.table: list[float] = []
-        self.parameters: list[tuple[int, int]] = []
 
     def write(self, following: Sequence[int], outputs: Sequence[int]) -> Text:
         rows = sum(self.layout.rows)
@@ -198,12 +173,9 @@ class _CppWriter(StatementWriter):
         self._line("const REAL *const c = f.c, *const fixed = f.fixed + b;")
         self._line("(void)c, (void)fixed, (void)rows;")
         slots = self._slots(following)
+        self._find_ends(slots)
         for slot, _, nodes in slots:
             if slot in self._in_memory:
-                node = ends_with(self.graph, self.schedule, self._taken_over, slot, nodes)
-                if node is not None:
-                    self._ends[slot] = node
-                    self._taken_over.add(node)
                 self._line(f"{self._type(nodes[0])} S{slot}[{len(nodes) * self.copies}];")
         for name, loop, place, node, j in self._carried(slots):
             read = "load_flag" if self.graph.type[node] == FLAG else "load"
@@ -221,11 +193,6 @@ class _CppWriter(StatementWriter):
             self._line(f"{loop}store(f.carry + b + {place} * room + {j} * W, {number});")
         self._lines.append("}")
 
-    def _slots(self, following: Sequence[int]) -> list[tuple[int, int, Sequence[int]]]:
-        """Every slot of the carry, where it starts, and what it becomes."""
-        starts = self._starts["state"]
-        return [(k, a, following[a:b]) for k, (a, b) in enumerate(itertools.pairwise(starts))]
-
     def _carried(
         self, slots: Sequence[tuple[int, int, Sequence[int]]]
     ) -> Iterator[tuple[str, str, str, int, int]]:
@@ -239,25 +206,6 @@ class _CppWriter(StatementWriter):
             for k, node in enumerate(nodes, start):
                 for j in range(self.copies):
                     yield f"s{k}{self._copy(j)}", "", str(k), node, j
-
-    def _follow(self, slots: Sequence[tuple[int, int, Sequence[int]]]) -> None:
-        """The carry becomes what follows, all at once: what lies in memory is copied last."""
-        late = list[tuple[int, str, int]]()
-        for slot, _, nodes in slots:
-            own = [("state", (slot, k)) for k in range(len(nodes))]
-            if slot not in self._in_memory or [(self.graph.op[n], self.graph.aux[n]) for n in nodes] == own:
-                continue
-            if slot in self._ends:
-                continue
-            self._line(f"{self._type(nodes[0])} next{slot}[{len(nodes) * self.copies}];")
-            self._fill(f"next{slot}", nodes)
-            late.append((slot, f"next{slot}", len(nodes) * self.copies))
-        short = [(start, nodes) for slot, start, nodes in slots if slot not in self._in_memory]
-        self._assign([(f"s{k}", node) for start, nodes in short for k, node in enumerate(nodes, start)])
-        for slot, name, size in late:
-            self._line(f"for (int p = 0; p < {size}; ++p) S{slot}[p] = {name}[p];")
-        for slot, node in self._ends.items():
-            self._entries(node, f"S{slot}")
 
     def _steps(self, following: Sequence[int]) -> None:
         """Write a step for a processor that is to expect that no row stays behind.
@@ -371,22 +319,4 @@ class _CppWriter(StatementWriter):
         return f"splat(c[{self._entry(node)}])"
 
     def _table(self, pack: int, at: str) -> str:
-        key = ("pack", pack)
-        if key not in self._index:
-            self._index[key] = len(self.table)
-            for node in self.graph.args[pack]:
-                self._enter(node)
-        return self._typed(pack, f"splat(c[{self._index[key]} + {at}])")
-
-    def _entry(self, node: int) -> int:
-        """The place of a number in the table."""
-        key = ("entry", node)
-        if key not in self._index:
-            self._index[key] = len(self.table)
-            self._enter(node)
-        return self._index[key]
-
-    def _enter(self, node: int) -> None:
-        if self.graph.op[node] == "param":
-            self.parameters.append((len(self.table), self.graph.aux[node]))
-        self.table.append(float(self.graph.value(node) or 0.0))
+        return self._typed(pack, f"splat(c[{self._entries_of(pack)} + {at}])")

@@ -1,192 +1,268 @@
-"""A row program on a CUDA device, a thread a row.
+"""A row program as CUDA C, a thread a row, all times inside.
 
-Run on an H100 by ``python -m tests.gpu``: equal to plain torch on the processor to 6e-15 in float64.
+Inputs are read where they lie, by strides and in their own dtypes; what is written lies with the rows
+innermost, so that the threads of a warp write one line. A number that the step captured stands in a table:
+in the kernel's arguments, which a multiplication reads as fast as a register, or in memory where it is long.
+The same text is C++ for the host, with loops in place of the grid.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import torch
-from torch import Tensor
 
-from ..call import Given
-from ..program import Program
-from ..trace.graph import ROW, STEP, Graph
-from ..trace.step import trace
-from ..tree import Shared, Tree, flatten, plain, unflatten
-from .c import Names, _ScalarWriter
+from ..trace.graph import FLAG, NARROW, REAL, ROW, STEP, WHOLE, WIDE, Graph
+from ..trace.tracer import LARGE, NotLoweredError
+from .c import Names, ScalarWriter
 from .schedule import Schedule, Sizes
+from .tables import TableWriter, Text
 
+KERNEL = "lanes_kernel"
 _KINDS = ("row", "now", "carry", "out")
-_BLOCK = 128
+_IN_ARGUMENTS = 2048  # bytes of a table that come with the arguments of a kernel, of which 4096 may be
+_CONSTANT = 48 * 1024  # bytes of arrays that constant memory holds
+_SIZES = {"short": 2, "int": 4, "float": 4, "double": 8}
+_OF_C = {
+    torch.float64: "double",
+    torch.float32: "float",
+    torch.int64: "long long",
+    torch.int32: "int",
+    torch.int16: "short",
+    torch.int8: "signed char",
+    torch.uint8: "unsigned char",
+    torch.bool: "unsigned char",
+}
 _PRELUDE = """#ifndef NAN
 #define NAN __int_as_float(0x7fffffff)
 #endif
 #ifndef INFINITY
 #define INFINITY __int_as_float(0x7f800000)
 #endif
+#ifndef OFFSET
+#define OFFSET int
+#endif
+#ifdef UNIT
+#define ENTRY(name) 1
+#else
+#define ENTRY(name) (OFFSET)call.name##_entry
+#endif
 """
-Compiler = Callable[[str, str], Callable[..., None]]
 
 
-def device_compiler(source: str, name: str) -> Callable[..., None]:
-    """Compile a kernel by NVRTC, through torch.
+class Dtypes(NamedTuple):
+    """Dtypes of what a kernel reads and writes."""
 
-    Raises:
-        RuntimeError: if this torch has no such way, or there is no device.
-    """
-    found = getattr(torch.cuda, "_compile_kernel", None)
-    if found is None:
-        raise RuntimeError(f"`lanes.cuda` needs torch 2.8 or later; got {torch.__version__}.")
-    kernel: Callable[..., None] = found(source, name)
-    return kernel
+    rows: Sequence[torch.dtype]
+    nows: Sequence[torch.dtype]
+    carries: Sequence[torch.dtype]
+    outputs: Sequence[torch.dtype]
 
 
-class CudaKernel:
-    """A program compiled for a device, for inputs of the shapes and dtypes of these.
+def emit_cuda(
+    graph: Graph, layout: Sizes, following: Sequence[int], outputs: Sequence[int], dtypes: Dtypes
+) -> Text:
+    """Write the kernel of a program: ``following`` are the carry after a step, ``outputs`` what it puts out.
 
-    Example:
-        >>> kernel = lanes.cuda.CudaKernel(program, x0, u, (gain,))  # tensors on the device
-        >>> x, history = kernel(x0, u, (gain,))
-
-    Args:
-        program: the program.
-        carry, now, row, steps: as in a call of it.
-        compile: source and name to a function called with grid, block, args.
-
-    Attributes:
-        source: CUDA C.
+    Its one argument is a structure: the addresses of row0, ..., now0, ..., carry0, ..., of the carry in the
+    end and of out0, ...; the table; for each input the strides from row to row, from time to time and from
+    entry to entry; the numbers of rows, times and times from one recorded to the next. Offsets in what is
+    written, and from entry to entry, are of the type `OFFSET`, 32 bits by default. With `UNIT` the entries of
+    every input lie side by side.
 
     Raises:
-        NotLoweredError: if an operation has no scalar form.
+        NotLoweredError: if an operation, or a dtype, has no scalar form.
     """
+    names = Names(
+        *([f"{kind}{k}" for k in range(len(sizes))] for kind, sizes in zip(_KINDS, layout, strict=True))
+    )
+    writer = _CudaWriter(graph, Schedule(graph, following, outputs), layout, names, dtypes)
+    return writer.write(following, outputs)
 
-    def __init__(
-        self,
-        program: Program,
-        carry: Tree,
-        now: Tree = (),
-        row: Tree = (),
-        *,
-        steps: int | None = None,
-        compile: Compiler = device_compiler,
-    ) -> None:
-        given = Given.of(carry, now, row, steps)
-        self._traced, self._real, self._key = trace(program.step, given, folded=True), given.real, given.key()
-        shared = [
-            f"{kind}{k}"
-            for kind, leaves in (("row", given.row), ("now", given.now))
-            for k, leaf in enumerate(leaves)
-            if isinstance(leaf, Shared)
+
+class _CudaWriter(ScalarWriter, TableWriter):
+    def __init__(self, graph: Graph, schedule: Schedule, layout: Sizes, names: Names, dtypes: Dtypes) -> None:
+        super().__init__(graph, schedule, layout, names)
+        self._all, self._dtypes = names, dtypes
+        self._constants: list[str] = []
+        self._held = 0  # bytes of them
+
+    def write(self, following: Sequence[int], outputs: Sequence[int]) -> Text:
+        body = self._function(lambda: self._body(following, outputs))
+        source = [_PRELUDE + "\n".join(self._arguments()), *self._constants]
+        source += [f'extern "C" __global__ void {KERNEL}(const __grid_constant__ Call call)', *body]
+        return Text("\n".join(source) + "\n", self.table, self.parameters)
+
+    def _arguments(self) -> list[str]:
+        names, dtypes, real = self._all, self._dtypes, self.real
+        read = [*zip(names.rows, dtypes.rows, strict=True), *zip(names.nows, dtypes.nows, strict=True)]
+        read += zip(names.carries, dtypes.carries, strict=True)
+        written = [(f"{name}_end", dtype) for name, dtype in zip(names.carries, dtypes.carries, strict=True)]
+        written += zip(names.outputs, dtypes.outputs, strict=True)
+        lines = [f"    const {_type_of(dtype)} *{name};" for name, dtype in read]
+        lines += [f"    {_type_of(dtype)} *{name};" for name, dtype in written]
+        size = max(len(self.table), 1)
+        here = in_arguments(size, self.graph.single)
+        lines += [f"    {real} c[{size}];" if here else f"    const {real} *c;"]
+        lines += [f"    long long {name}_row, {name}_time, {name}_entry;" for name, _ in read]
+        macro = "call.c[at]" if here else "__ldg(call.c + (at))"
+        return [
+            "struct Call {",
+            *lines,
+            "    long long rows;",
+            "    int times, every;",
+            "};",
+            f"#define TABLE(at) {macro}",
         ]
-        self.source = _PRELUDE + cuda_text(*self._traced.program, name="lanes_kernel", shared=shared)
-        self._kernel = compile(self.source, "lanes_kernel")
 
-    def __call__(
-        self, carry: Tree, now: Tree = (), row: Tree = (), *, steps: int | None = None, every: int = 1
-    ) -> tuple[Tree, Tree]:
-        """The carry after the last step, and the outputs at every ``every``-th time, as the program's.
+    def _constant_array(self, name: str, kind: str, values: Iterable[str]) -> None:
+        if name in self._arrays:
+            return
+        self._arrays.add(name)
+        written = [*values]
+        size = len(written) * _SIZES[kind]
+        fits = self._held + size <= _CONSTANT
+        self._held += size if fits else 0
+        memory = "__constant__" if fits else "__device__ const"
+        self._constants.append(f"{memory} {kind} {name}[] = {{{', '.join(written)}}};")
 
-        Raises:
-            ValueError: if the inputs have other shapes or dtypes than those that the kernel was made for.
-        """
-        given = Given.of(carry, now, row, steps)
-        if given.key() != self._key:
-            raise ValueError("`CudaKernel(...)` needs inputs of the shapes that it was made for.")
-        rows, recorded = given.rows, -(-given.times // every)
-        leaves = flatten((row, now, carry))[0]
-        times = [0] * len(given.row) + [1] * len(given.now) + [0] * len(given.carry)
-        read = [self._packed(leaf, timed) for leaf, timed in zip(leaves, times, strict=True)]
-        like = torch.empty(0, dtype=self._real, device=plain(leaves[-1]).device)
-        ends = [like.new_empty(leaf[0].numel(), rows) for leaf in given.carry]
-        outs = [like.new_empty(recorded, shape.numel(), rows) for shape, _ in self._traced.outputs]
-        grid = (-(-rows // _BLOCK), 1, 1)
-        self._kernel(grid, (_BLOCK, 1, 1), [rows, given.times, every, *read, *ends, *outs])
-        after = [
-            room.mT.reshape(leaf.shape).to(leaf.dtype) for room, leaf in zip(ends, given.carry, strict=True)
-        ]
-        results = [
-            room.permute(2, 0, 1).reshape(rows, recorded, *shape).to(dtype)
-            for room, (shape, dtype) in zip(outs, self._traced.outputs, strict=True)
-        ]
-        return given.tree("carry", after), unflatten(self._traced.structure, iter(results))
-
-    def _packed(self, leaf: Any, timed: int) -> Tensor:
-        """The numbers of an input as the kernel reads them: (times, entries, rows)."""
-        tensor = plain(leaf).to(self._real)
-        if isinstance(leaf, Shared):
-            return tensor.contiguous()
-        flat = tensor.reshape(*tensor.shape[: 1 + timed], -1)
-        return flat.movedim(0, -1).contiguous()
-
-
-class _CudaWriter(_ScalarWriter):
-    def __init__(self, *given: Any, shared: Sequence[str]) -> None:
-        super().__init__(*given)
-        self._shared = frozenset(shared)
+    # Numbers that are read.
 
     def _fma(self, a: str, b: str, c: str) -> str:
         return f"fma{self._suffix}({a}, {b}, {c})"
 
     def _buffer(self, op: str, place: int, j: int, at: str = "0") -> str:
         slot, entry = self._slot(op, place)
-        name, sizes = self._names[op][slot], {"row": self.layout.rows, "now": self.layout.nows}[op]
-        index = f"{entry}" if at == "0" else f"({entry} + {at})"
-        if op == "now":
-            index = f"(t * {sizes[slot]} + {index})"
-        return f"{name}[{index}]" if name in self._shared else f"{name}[{index} * rows + r]"
+        name, single = self._names[op][slot], self._size(op, slot) == 1
+        index = f"{entry}" if at == "0" else f"({entry} + {at})" if entry else f"({at})"
+        step = "" if single or index == "0" else f" + {index} * {name}_entry"
+        return self._read_as_real(f"__ldg({name}{step})", self._dtype(op, slot))
 
-    def body(self, names: Names, following: Sequence[int], outputs: Sequence[int]) -> None:
+    def _size(self, op: str, slot: int) -> int:
+        return {"row": self.layout.rows, "now": self.layout.nows, "state": self.layout.carries}[op][slot]
+
+    def _dtype(self, op: str, slot: int) -> torch.dtype:
+        held = self._dtypes
+        return {"row": held.rows, "now": held.nows, "state": held.carries}[op][slot]
+
+    def _read_as_real(self, text: str, dtype: torch.dtype) -> str:
+        """A number from memory as the program's float, or as double where that is its own."""
+        kind = _type_of(dtype)
+        wide = "double" if dtype == torch.float64 else self.real
+        return text if kind == wide else f"({wide}){text}"
+
+    def _literal(self, node: int) -> str:
+        if self.graph.op[node] == "param":
+            return self._typed(node, f"TABLE({self._entry(node)})")
+        return super()._literal(node)
+
+    def _table(self, pack: int, at: str) -> str:
+        if all(self.graph.op[node] == "const" for node in self.graph.args[pack]):
+            return super()._table(pack, at)
+        start = self._entries_of(pack)
+        return self._typed(pack, f"TABLE({start} + {at})" if start else f"TABLE({at})")
+
+    # The kernel.
+
+    def _body(self, following: Sequence[int], outputs: Sequence[int]) -> None:
+        names = self._all
         self._lines.append("{")
-        self._line("const long long rows = row_count, times = time_count, every = period;")
-        self._line("const long long r = (long long)blockIdx.x * blockDim.x + threadIdx.x;")
+        self._line("const OFFSET rows = call.rows, r = (OFFSET)blockIdx.x * blockDim.x + threadIdx.x;")
         self._line("if (r >= rows) return;")
+        for op, some in (("row", names.rows), ("now", names.nows), ("state", names.carries)):
+            for slot, name in enumerate(some):
+                kind = _type_of(self._dtype(op, slot))
+                moves = "" if op == "now" else "const "
+                self._line(f"const {kind} *{moves}{name} = call.{name} + r * call.{name}_row;")
+                self._line(f"const OFFSET {name}_entry = ENTRY({name});")
         self._block(self.schedule.block(ROW))
-        for place, node in enumerate(following):
-            slot, entry = self._slot("state", place)
-            value = self._typed(node, f"{names.carries[slot]}[{entry} * rows + r]")
-            self._line(f"{self._type(node)} s{place} = {value};")
-        with self._braces("for (long long t = 0; t < times; ++t)"):
+        slots = self._slots(following)
+        self._find_ends(slots)
+        for slot, start, nodes in slots:
+            self._begin(slot, start, nodes)
+        self._line("OFFSET place = r;")
+        with self._braces("for (int t = 0, due = 0; t < call.times; ++t)"):
             self._block(self.schedule.block(STEP))
-            self._line("if (t % every == 0) {")
-            done = 0
-            for name, size in zip(names.outputs, self.layout.outputs, strict=True):
-                for e in range(size):
-                    value = self._ref(outputs[done + e], 0)
-                    self._line(f"    {name}[(t / every * {size} + {e}) * rows + r] = {value};")
-                done += size
-            self._line("}")
-            self._assign([(f"s{k}", node) for k, node in enumerate(following)])
-        for place in range(len(following)):
-            slot, entry = self._slot("state", place)
-            self._line(f"{names.carries[slot]}_end[{entry} * rows + r] = s{place};")
+            self._write_outputs(outputs)
+            self._follow(slots)
+            for name in names.nows:
+                self._line(f"{name} += call.{name}_time;")
+        for slot, start, nodes in slots:
+            self._end(slot, start, nodes)
         self._lines.append("}")
 
+    def _begin(self, slot: int, start: int, nodes: Sequence[int]) -> None:
+        kind = self._type(nodes[0]) if nodes else ""
+        if slot in self._in_memory:
+            self._line(f"{kind} S{slot}[{len(nodes)}];")
+            value = self._typed(nodes[0], self._buffer("state", start, 0, "p"))
+            self._line(f"for (int p = 0; p < {len(nodes)}; ++p) S{slot}[p] = {value};")
+            return
+        for place, node in enumerate(nodes, start):
+            value = self._typed(node, self._buffer("state", place, 0))
+            self._line(f"{kind} s{place} = {value};")
 
-def cuda_text(
-    graph: Graph,
-    layout: Sizes,
-    following: Sequence[int],
-    outputs: Sequence[int],
-    *,
-    name: str,
-    shared: Sequence[str],
-) -> str:
-    """Return CUDA C of a program, a thread a row, all times inside.
+    def _end(self, slot: int, start: int, nodes: Sequence[int]) -> None:
+        name, dtype = f"call.{self._all.carries[slot]}_end", self._dtypes.carries[slot]
+        if slot in self._in_memory:
+            value = _as(dtype, self.real, f"S{slot}[p]", self.graph.type[nodes[0]])
+            loop = f"for (int p = 0; p < {len(nodes)}; ++p)"
+            self._line(f"{loop} {name}[(OFFSET)p * rows + r] = {value};")
+            return
+        for e, node in enumerate(nodes):
+            value = _as(dtype, self.real, f"s{start + e}", self.graph.type[node])
+            self._line(f"{name}[{_times('rows', e)}r] = {value};")
 
-    ``NAME(row_count, time_count, period, row..., now..., carry..., carry_end..., out...)``; the numbers of a
-    time lie together, entry after entry, a row beside the other: (times, entries, rows), without rows where
-    shared: row0, now1, ...
-    """
-    names = Names(
-        *([f"{kind}{k}" for k in range(len(sizes))] for kind, sizes in zip(_KINDS, layout, strict=True))
-    )
-    writer = _CudaWriter(graph, Schedule(graph, following, outputs), layout, names, shared=shared)
-    read = [f"const {writer.real} *{n}" for n in (*names.rows, *names.nows, *names.carries)]
-    written = [f"{writer.real} *{n}" for n in (*(f"{c}_end" for c in names.carries), *names.outputs)]
-    arguments = ["int row_count", "int time_count", "int period", *read, *written]
-    lines = [f'extern "C" __global__ void {name}({", ".join(arguments)})']
-    lines += writer._function(lambda: writer.body(names, following, outputs))
-    return "\n".join(lines) + "\n"
+    def _write_outputs(self, outputs: Sequence[int]) -> None:
+        if not outputs:
+            return
+        with self._braces("if (due == 0)"):
+            self._line("due = call.every;")
+            done = 0
+            for name, size, dtype in zip(
+                self._all.outputs, self.layout.outputs, self._dtypes.outputs, strict=True
+            ):
+                self._write_output(name, outputs[done : done + size], dtype)
+                done += size
+            self._line("place += rows;")
+        self._line("--due;")
+
+    def _write_output(self, name: str, nodes: Sequence[int], dtype: torch.dtype) -> None:
+        """Entries of an output: those of row r at a time begin at (size * recorded) * rows + r."""
+        size = len(nodes)
+        at = "place" if size == 1 else f"{size} * place - {size - 1} * r"
+        if size > LARGE:
+            array = f"o_{name}"
+            self._line(f"{self._type(nodes[0])} {array}[{size}];")
+            self._fill(array, nodes)
+            value = _as(dtype, self.real, f"{array}[p]", self.graph.type[nodes[0]])
+            self._line(f"for (int p = 0; p < {size}; ++p) call.{name}[{at} + p * rows] = {value};")
+            return
+        for e, node in enumerate(nodes):
+            value = _as(dtype, self.real, self._ref(node, 0), self.graph.type[node])
+            self._line(f"call.{name}[{at}{f' + {e} * rows' if e else ''}] = {value};")
+
+
+def in_arguments(numbers: int, single: bool) -> bool:
+    """Return whether a table of so many numbers comes with the arguments of its kernel."""
+    return numbers * (4 if single else 8) <= _IN_ARGUMENTS
+
+
+def _times(factor: str, count: int) -> str:
+    return "" if count == 0 else f"{factor} + " if count == 1 else f"{count} * {factor} + "
+
+
+def _as(dtype: torch.dtype, real: str, text: str, kind: str) -> str:
+    """A number of the program as one of a dtype."""
+    wanted = _type_of(dtype)
+    held = {REAL: real, WHOLE: real, WIDE: "double", NARROW: "double", FLAG: "int"}[kind]
+    if dtype == torch.bool and kind != FLAG:
+        return f"({text} != 0)"
+    return text if wanted == held else f"({wanted})({text})"
+
+
+def _type_of(dtype: torch.dtype) -> str:
+    if dtype not in _OF_C:
+        raise NotLoweredError(f"{dtype} is not read or written by a kernel", "half")
+    return _OF_C[dtype]

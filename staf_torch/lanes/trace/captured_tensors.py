@@ -216,7 +216,7 @@ def tensors(value: Any) -> list[Tensor]:
 
 def _read(tensor: Tensor, at: np.ndarray[Any, Any]) -> Tensor:
     with _disable_current_modes():  # the tracer itself among them
-        return tensor.detach().double().reshape(-1)[at]
+        return tensor.detach().double().reshape(-1)[at].cpu()
 
 
 def _joined(parts: Sequence[Tensor]) -> Tensor:

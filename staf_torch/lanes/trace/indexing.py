@@ -40,7 +40,7 @@ def moved(t: Tracer, func: Any, out: Any, args: Sequence[Any], kwargs: dict[str,
         if isinstance(value, Tensor) and not fixed:
             nodes = t.nodes(value, kind) - zero  # what torch fills with 0 is then the node of 0
             return torch.from_numpy(np.array(nodes))  # `ascontiguousarray` knows none without dimensions
-        return value
+        return value.cpu() if isinstance(value, Tensor) else value
 
     values = [numbers(a, position == at) for position, a in enumerate(args)]
     if name in ("scatter", "constant_pad_nd") and not isinstance(args[-1], Tensor | list):
@@ -72,7 +72,7 @@ def _accumulated(t: Tracer, out: Tensor, a: Tensor, index: Sequence[Tensor | Non
         raise NotLoweredError(reason, "scatter_add")
     kind = t.kind(out.dtype)
     places = torch.arange(a.numel(), device="cpu").reshape(a.shape)[
-        tuple(slice(None) if i is None else i for i in index)
+        tuple(slice(None) if i is None else i.cpu() for i in index)
     ]
     nodes = np.broadcast_to(t.nodes(a, kind), a.shape).reshape(-1).copy()
     added = np.broadcast_to(t.nodes(source, kind), tuple(places.shape)).reshape(-1)

@@ -1,0 +1,5 @@
+"""Devices that run the kernel of a row program: CUDA, and the host in the place of one."""
+
+from .host import host as host
+
+__all__ = ["host"]

@@ -1,0 +1,251 @@
+"""CUDA devices: kernels by NVRTC, kept as machine code in the user's cache, launched on torch's stream.
+
+NVRTC is NVIDIA's compiler as a library: that of `cuda.bindings` and `cuda.core` (the extra ``cuda``) or the
+one that torch brings. Machine code is loaded and launched by the driver itself, which every device has: a
+launch is then two microseconds of Python, knows nothing of tensors, and is recorded by a graph.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import hashlib
+import importlib
+import itertools
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ...signs import Sign
+from ..cache import cache, found, publish, scratch, used
+from ..emit.cuda import KERNEL
+from ..locks import Mutex
+
+_log = logging.getLogger(__name__)
+REMEDY = "install torch with CUDA, or `pip install staf-torch[cuda]`"
+_OPTIONS = ("--std=c++17", "--fmad=false")
+_DIGEST = 32
+_WARP, _BLOCK = 32, 128
+_FEW = 8  # warps a multiprocessor up to which every warp is a block, so that all multiprocessors have some
+_NO_CONTEXT = (3, 201)  # not initialised, invalid context
+_NUMBER_OF_REGISTERS, _LOCAL_BYTES = 4, 3  # attributes of a function
+_lock = Mutex()
+
+
+class CudaDevice:
+    """One device of CUDA.
+
+    Args:
+        index: as torch counts them.
+    """
+
+    def __init__(self, index: int) -> None:
+        self.index = index
+        properties = torch.cuda.get_device_properties(index)
+        self._few = _FEW * _WARP * int(properties.multi_processor_count)
+        self.architecture = 10 * int(properties.major) + int(properties.minor)
+        self._kernels: dict[str, ctypes.c_void_p] = {}
+        self._launch = _driver().cuLaunchKernel
+        self._stream = torch._C._cuda_getCurrentRawStream
+
+    def compile(self, text: str) -> ctypes.c_void_p:
+        """Return the kernel of a text, loaded.
+
+        Raises:
+            OSError: if there is no compiler, or it or the driver refuses the text.
+        """
+        with _lock:
+            kernel = self._kernels.get(text)
+            if kernel is None:
+                code = machine_code(text, self.architecture)
+                with torch.cuda.device(self.index):
+                    kernel = self._kernels[text] = self._loaded(code)
+            return kernel
+
+    def _loaded(self, code: bytes) -> ctypes.c_void_p:
+        driver, module, kernel = _driver(), ctypes.c_void_p(), ctypes.c_void_p()
+        self._with_context()
+        _checked(driver.cuModuleLoadData(ctypes.byref(module), code))
+        _checked(driver.cuModuleGetFunction(ctypes.byref(kernel), module, KERNEL.encode()))
+        return kernel
+
+    def _with_context(self) -> None:
+        """Let this thread have the context of the device that torch uses, which its calls need not make."""
+        driver, number, context = _driver(), ctypes.c_int(), ctypes.c_void_p()
+        _checked(driver.cuInit(0))
+        _checked(driver.cuDeviceGet(ctypes.byref(number), self.index))
+        _checked(driver.cuDevicePrimaryCtxRetain(ctypes.byref(context), number))
+        _checked(driver.cuCtxSetCurrent(context))
+
+    def attributes(self, text: str) -> dict[str, int]:
+        """Return the registers of a thread and the bytes of memory of its own, of a kernel."""
+        kernel, value, read = self.compile(text), ctypes.c_int(), {}
+        for name, number in (("registers", _NUMBER_OF_REGISTERS), ("local", _LOCAL_BYTES)):
+            _checked(_driver().cuFuncGetAttribute(ctypes.byref(value), number, kernel))
+            read[name] = value.value
+        return read
+
+    def launch(self, kernel: ctypes.c_void_p, arguments: int, rows: int) -> None:
+        """Put a kernel for so many rows on the stream that torch has on this device now."""
+        if torch._C._cuda_getDevice() != self.index:
+            with torch.cuda.device(self.index):
+                return self.launch(kernel, arguments, rows)
+        block = _WARP if rows <= self._few else _BLOCK
+        given = (ctypes.c_void_p * 1)(arguments)
+        grid = -(-rows // block), 1, 1, block, 1, 1
+        failed = self._launch(kernel, *grid, 0, self._stream(self.index), given, None)
+        if failed in _NO_CONTEXT:  # of a thread that has not asked torch for anything yet
+            self._with_context()
+            failed = self._launch(kernel, *grid, 0, self._stream(self.index), given, None)
+        return _checked(failed) if failed else None
+
+
+@functools.cache
+def _driver() -> Any:
+    """Return the driver.
+
+    Raises:
+        OSError: if there is none.
+    """
+    driver = None
+    for name in ("libcuda.so.1", "nvcuda.dll"):
+        try:
+            driver = ctypes.CDLL(name)
+            break
+        except OSError:
+            continue
+    if driver is None:
+        raise OSError("no driver of CUDA (libcuda.so.1) is to be found")
+    word, size = ctypes.c_void_p, ctypes.c_uint
+    driver.cuCtxSetCurrent.argtypes = (word,)
+    driver.cuLaunchKernel.argtypes = (word, *[size] * 6, size, word, word, word)
+    driver.cuModuleLoadData.argtypes = (word, ctypes.c_char_p)
+    driver.cuModuleGetFunction.argtypes = (word, word, ctypes.c_char_p)
+    driver.cuFuncGetAttribute.argtypes = (word, ctypes.c_int, word)
+    return driver
+
+
+def _checked(failed: int) -> None:
+    if failed:
+        told = ctypes.c_char_p()
+        _driver().cuGetErrorString(failed, ctypes.byref(told))
+        raise OSError(f"CUDA's driver says {(told.value or b'?').decode()} ({failed})")
+
+
+def machine_code(text: str, architecture: int) -> bytes:
+    """Return the machine code of a text for an architecture (90 of sm_90), from the cache where it is.
+
+    Raises:
+        OSError: if there is no compiler, or it refuses the text.
+    """
+    compiler = _nvrtc()
+    version = "none" if compiler is None else compiler.version
+    parts = (text, *_OPTIONS, str(architecture))
+    made_of = f"kernel-{_digest(*parts)[:24]}"
+    names = f"{made_of}-{_digest(version)[:8]}.cubin" if compiler is not None else f"{made_of}-*.cubin"
+    for path in found(names):
+        content = path.read_bytes()
+        if content[-_DIGEST:] == hashlib.sha256(content[:-_DIGEST]).digest():
+            used(path)
+            return content[:-_DIGEST]
+    if compiler is None:
+        raise OSError(f"no compiler of CUDA (NVRTC) is to be found: {REMEDY}")
+    lines = text.count("\n")
+    with Sign(f"compiling {lines} lines for sm_{architecture}, once"):
+        code = compiler.compile(text, architecture)
+    path = cache() / names
+    with scratch(path.parent) as place:
+        (place / path.name).write_bytes(code + hashlib.sha256(code).digest())
+        publish(place / path.name, path)
+    return code
+
+
+def _digest(*parts: str) -> str:
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()
+
+
+class Nvrtc:
+    """NVIDIA's compiler as a library.
+
+    Args:
+        path: of it, or a name that the system finds.
+    """
+
+    def __init__(self, path: str) -> None:
+        self.path, self._library = path, ctypes.CDLL(path)
+        word, call = ctypes.c_void_p, self._library
+        call.nvrtcCreateProgram.argtypes = (word, ctypes.c_char_p, ctypes.c_char_p, ctypes.c_int, word, word)
+        call.nvrtcCompileProgram.argtypes = (word, ctypes.c_int, word)
+        for name in ("ProgramLog", "CUBIN", "PTX"):
+            getattr(call, f"nvrtcGet{name}").argtypes = (word, ctypes.c_char_p)
+            getattr(call, f"nvrtcGet{name}Size").argtypes = (word, word)
+        major, minor = ctypes.c_int(), ctypes.c_int()
+        call.nvrtcVersion(ctypes.byref(major), ctypes.byref(minor))
+        self.version = f"{major.value}.{minor.value}"
+
+    def architectures(self) -> list[int]:
+        """Return the architectures for which it makes machine code."""
+        count = ctypes.c_int()
+        self._library.nvrtcGetNumSupportedArchs(ctypes.byref(count))
+        held = (ctypes.c_int * count.value)()
+        self._library.nvrtcGetSupportedArchs(held)
+        return list(held)
+
+    def compile(self, text: str, architecture: int) -> bytes:
+        """Return machine code, or PTX of the latest that it knows where a card is newer.
+
+        Raises:
+            OSError: with what it says.
+        """
+        known = self.architectures()
+        latest = max((each for each in known if each <= architecture), default=architecture)
+        kind = "sm" if architecture in known else "compute"
+        options = [*_OPTIONS, f"--gpu-architecture={kind}_{architecture if kind == 'sm' else latest}"]
+        words = (ctypes.c_char_p * len(options))(*(each.encode() for each in options))
+        program, library = ctypes.c_void_p(), self._library
+        library.nvrtcCreateProgram(ctypes.byref(program), text.encode(), b"lanes.cu", 0, None, None)
+        try:
+            if library.nvrtcCompileProgram(program, len(options), words):
+                raise OSError(f"NVRTC {self.version}: {self._read('ProgramLog', program).decode()[:600]}")
+            code = self._read("CUBIN" if kind == "sm" else "PTX", program)
+        finally:
+            library.nvrtcDestroyProgram(ctypes.byref(program))
+        return code
+
+    def _read(self, what: str, program: ctypes.c_void_p) -> bytes:
+        size = ctypes.c_size_t()
+        getattr(self._library, f"nvrtcGet{what}Size")(program, ctypes.byref(size))
+        held = ctypes.create_string_buffer(size.value)
+        getattr(self._library, f"nvrtcGet{what}")(program, held)
+        return held.raw
+
+
+@functools.cache
+def _nvrtc() -> Nvrtc | None:
+    for path in _libraries():
+        try:
+            return Nvrtc(path)
+        except (OSError, AttributeError):
+            continue
+    return None
+
+
+def _libraries() -> Iterator[str]:
+    """Yield where NVRTC may be: what `cuda.bindings` finds, what torch brings, what the system has."""
+    try:
+        pathfinder: Any = importlib.import_module("cuda.pathfinder")
+        yield str(pathfinder.load_nvidia_dynamic_lib("nvrtc").abs_path)
+    except Exception as error:  # not installed, or it finds none: of any kind
+        _log.debug("cuda.pathfinder finds no NVRTC: %s", error)
+    version = (torch.version.cuda or "").partition(".")[0]
+    packages = Path(torch.__file__).parent.parent / "nvidia"
+    places = (
+        packages.glob("*/lib/libnvrtc.so.*"),
+        (Path(torch.__file__).parent / "lib").glob("libnvrtc*.so*"),
+    )
+    there = [str(path) for path in itertools.chain(*places) if "builtins" not in path.name]
+    yield from sorted(there, key=lambda path: not path.endswith(f".so.{version}"))
+    yield from (f"libnvrtc.so.{version}", "libnvrtc.so")

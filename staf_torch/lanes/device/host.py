@@ -1,0 +1,92 @@
+"""The host in the place of a device: a kernel built by g++, with loops in the place of its grid.
+
+Everything but the card is what runs on one: dispatch, strides, tables, caches, errors. For tests, and for
+whoever wants to see a kernel's numbers without a card; one thread, and slower than what serves the processor.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from .. import call
+from ..compiler import library
+from ..locks import Mutex
+
+_FOLDER = Path(__file__).parent
+_OPTIONS = ("-O1", "-march=native", "-std=c++17", "-shared", "-fPIC", "-w", "-ffp-contract=off")
+_BEFORE = """#include <cmath>
+using namespace std;
+#define __global__
+#define __device__ static
+#define __constant__ static const
+#define __grid_constant__
+template <typename T> static inline T __ldg(const T *from) { return *from; }
+struct Place { long long x; };
+static thread_local Place blockIdx, blockDim, threadIdx;
+"""
+_AFTER = """
+extern "C" void launch(const Call *call, long long blocks, long long threads) {
+    blockDim.x = threads;
+    for (blockIdx.x = 0; blockIdx.x < blocks; ++blockIdx.x)
+        for (threadIdx.x = 0; threadIdx.x < threads; ++threadIdx.x) lanes_kernel(*call);
+}
+"""
+_BLOCK = 32
+_kernels: dict[str, Callable[..., None]] = {}
+_lock = Mutex()
+
+
+@contextlib.contextmanager
+def host() -> Iterator[None]:
+    """Context: programs take the processor's tensors for those of a device, and run kernels built by g++.
+
+    Example:
+        >>> program = lanes.Program(lambda x, now, row: (0.5 * x, x))
+        >>> with lanes.device.host():
+        ...     program(torch.ones(1), steps=3)[1]
+        tensor([[1.0000, 0.5000, 0.2500]])
+
+        Shown by `staf_torch/lanes/DEVICE.md`.
+
+    Of the whole process; what is tested is the way to a CUDA device without one.
+    """
+    before, call.processor = call.processor, torch.device("cpu")
+    try:
+        yield
+    finally:
+        call.processor = before
+
+
+class HostDevice:
+    """A device whose kernels g++ builds."""
+
+    def compile(self, text: str) -> Callable[..., None]:
+        """Return the kernel of a text.
+
+        Raises:
+            OSError: if there is no compiler, or it refuses the text.
+        """
+        with _lock:
+            found = _kernels.get(text)
+            if found is None:
+                path = library("kernel", _BEFORE + text + _AFTER, _OPTIONS, _FOLDER)
+                found = ctypes.CDLL(str(path)).launch
+                found.restype, found.argtypes = None, (ctypes.c_void_p, ctypes.c_longlong, ctypes.c_longlong)
+                _kernels[text] = found
+            return found
+
+    def launch(self, kernel: Any, arguments: int, rows: int) -> None:
+        """Run a kernel for so many rows.
+
+        Args:
+            kernel: of `compile`.
+            arguments: the address of its structure.
+            rows: at least 1.
+        """
+        kernel(arguments, -(-rows // _BLOCK), _BLOCK)

@@ -1,0 +1,160 @@
+"""Kernels of a program, and prepared calls of them: what `call.PlannedCall` is for the processor."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import struct
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from ..call import Compiled, entries_lie_evenly, inner_strides
+from ..emit.cuda import in_arguments
+from ..locks import Mutex
+from ..row_numbers import columns
+from ..tree import Shared, plain
+from .cuda import CudaDevice
+from .host import HostDevice
+
+_MOST = 2**31 - 1  # of an offset of 32 bits
+
+
+class Device(Protocol):
+    """What runs kernels."""
+
+    def compile(self, text: str) -> Any:
+        """Return the kernel of a text; raises OSError where it cannot."""
+
+    def launch(self, kernel: Any, arguments: int, rows: int) -> None:
+        """Start a kernel for so many rows, with the structure at an address."""
+
+
+@functools.cache
+def device(where: torch.device) -> Device:
+    """Return what runs the kernels of tensors there.
+
+    Raises:
+        OSError: if the driver is missing.
+    """
+    return HostDevice() if where.type == "cpu" else CudaDevice(where.index)
+
+
+def kernel_text(source: str, *, unit: bool, wide: bool) -> str:
+    """Return the text of a kernel for a kind of inputs.
+
+    Args:
+        source: of `emit_cuda`.
+        unit: whether the entries of every input lie side by side.
+        wide: whether offsets take 64 bits.
+    """
+    head = ["#define UNIT"] if unit else []
+    head += ["#define OFFSET long long"] if wide else []
+    return "\n".join([*head, source])
+
+
+class DeviceCall:
+    """A prepared call of a kernel. Inputs are read where they lie, whatever their strides; nothing waits.
+
+    Args:
+        compiled: the program, whose call is the text of its kernel.
+        leaves: examples of the inputs: what a row has once, what times bring, the carry.
+        times: for each of them, whether a dimension of times comes first (after the rows).
+        rows, steps, every: of the call.
+        once: how many of the leaves a row has once.
+        where: the device.
+
+    Attributes:
+        structure: of the outputs.
+        text: of the kernel.
+
+    Raises:
+        OSError: if the kernel cannot be built or loaded.
+    """
+
+    direct = False
+
+    def __init__(
+        self,
+        compiled: Compiled,
+        leaves: Sequence[Any],
+        times: Sequence[bool],
+        *,
+        rows: int,
+        steps: int,
+        every: int,
+        once: int,
+        where: torch.device,
+    ) -> None:
+        self._compiled, self.structure, self._rows, self._once = compiled, compiled.structure, rows, once
+        self._where = where
+        leaves = self._with_columns(leaves)
+        times = [*times[:once], *[False] * len(compiled.rows), *times[once:]]
+        self._copied: list[int] = []  # inputs without one stride from entry to entry, or from elsewhere
+        read = [self._input(k, *given) for k, given in enumerate(zip(leaves, times, strict=True))]
+        recorded = -(-steps // every)
+        self._rooms = [((rows, *s), (1, *inner_strides(s, rows)), dtype) for s, dtype in compiled.carry]
+        for s, dtype in compiled.outputs:
+            strides = 1, s.numel() * rows, *inner_strides(s, rows)
+            self._rooms.append(((rows, recorded, *s), strides, dtype))
+        most = max([s.numel() for s, _ in (*compiled.carry, *compiled.outputs)], default=1)
+        reach = max([abs(entry) * entries for *_, entry, entries in read], default=0)
+        wide = max(rows * (recorded + 1) * most, reach) > _MOST
+        unit = all(entry == 1 or entries == 1 for *_, entry, entries in read)
+        self._device = device(where)
+        self.text = kernel_text(compiled.call, unit=unit, wide=wide)
+        self._kernel = self._device.compile(self.text)
+        self._arguments(read, rows, steps, every)
+
+    def _arguments(self, read: Sequence[tuple[int, ...]], rows: int, steps: int, every: int) -> None:
+        table = self._compiled.table
+        pointers, numbers = len(read) + len(self._rooms), table.tolist()
+        kind = "f" if self._compiled.real == torch.float32 else "d"
+        held = f"{len(numbers)}{kind}"
+        if not in_arguments(len(numbers), kind == "f"):
+            self._table = table.to(self._where)  # kept
+            numbers, held = [self._table.data_ptr()], "P"
+        strides = [stride for slot in read for stride in slot[:3]]
+        whole = struct.Struct(f"{pointers}P{held}{len(strides)}qq2i0q")
+        self._record = ctypes.create_string_buffer(whole.size)
+        whole.pack_into(self._record, 0, *[0] * pointers, *numbers, *strides, rows, steps, every)
+        self._pack = struct.Struct(f"{pointers}P").pack_into
+        self._reference, self._lock = ctypes.addressof(self._record), Mutex()
+
+    def _input(self, k: int, leaf: Any, timed: bool) -> tuple[int, int, int, int]:
+        """Strides from row to row, from time to time and from entry to entry, and how many entries."""
+        shared, tensor = type(leaf) is Shared, plain(leaf)
+        lead = 1 + timed - shared
+        inner, strides = tensor.shape[lead:], tensor.stride()
+        if tensor.device != self._where or tensor.dim() == 0 or not entries_lie_evenly(inner, strides[lead:]):
+            self._copied.append(k)
+            strides = inner_strides(tensor.shape, 1)
+        longer = [stride for size, stride in zip(inner, strides[lead:], strict=True) if size > 1]
+        row, time = 0 if shared else strides[0], strides[lead - 1] if timed else 0
+        return row, time, longer[-1] if longer else 1, inner.numel()
+
+    def __call__(self, leaves: Sequence[Any]) -> list[Tensor]:
+        """Return the carry after the last step and the outputs, all new, on the device's current stream.
+
+        Args:
+            leaves: inputs of the forms that the examples had.
+        """
+        given = [leaf.tensor if type(leaf) is Shared else leaf for leaf in self._with_columns(leaves)]
+        for k in self._copied:
+            given[k] = given[k].to(self._where).contiguous()
+        where, empty = self._where, torch.empty_strided
+        rooms = [empty(shape, strides, dtype=dtype, device=where) for shape, strides, dtype in self._rooms]
+        with self._lock:  # the driver copies the structure when it is called
+            self._pack(self._record, 0, *map(_address, given), *map(_address, rooms))
+            self._device.launch(self._kernel, self._reference, self._rows)
+        return rooms
+
+    def _with_columns(self, leaves: Sequence[Any]) -> Sequence[Any]:
+        if not self._compiled.rows:
+            return leaves
+        return [*leaves[: self._once], *columns(self._compiled.rows, self._rows), *leaves[self._once :]]
+
+
+_address = Tensor.data_ptr

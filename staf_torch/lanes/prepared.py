@@ -1,0 +1,86 @@
+"""Calls of a program for inputs of fixed forms, with everything found out that does not change."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from .call import Given, PlannedCall, Where, form, ordinary, whole
+from .device.kernel import DeviceCall
+from .opaque import opaque
+from .tree import Tree, flatten, unflatten
+
+if TYPE_CHECKING:
+    from .program import Program
+
+_log = logging.getLogger(f"{__package__}.program")
+_said: set[tuple[str, str]] = set()  # what has been logged
+
+
+def say(name: str, reason: str, kind: str | None = None) -> None:
+    """Log why a program runs in plain torch, once for a reason or a kind of reasons."""
+    reason = " ".join(reason.split())[:600]
+    told = name, reason if kind is None else kind
+    if told not in _said:
+        _said.add(told)
+        _log.warning("%s runs in plain torch, slower: %s", name, reason)
+
+
+class Prepared:
+    """A call of a program for inputs of fixed shapes, strides and dtypes; `Program.prepare` makes one.
+
+    Called as the program is, without ``steps`` and ``every``. Inputs of other forms go to the program.
+
+    Attributes:
+        plan: of the compiled call, once there was one; None before, and where the definition runs.
+            On a device of its own it is a plan of kernels.
+    """
+
+    def __init__(self, program: Program, given: Given, every: int) -> None:
+        self._program, self._steps, self._every = program, given.times, whole("every", every, 1)
+        leaves, self._structure = flatten(given.trees())
+        self._forms = tuple(map(form, leaves))
+        self._carries, self._carry = len(given.carry), given.structures["carry"]
+        self.plan: PlannedCall | DeviceCall | None = None
+        self._where: Where | None = None  # of the plan, be there one or not
+        self._refused = given.rows == 0 or given.times == 0
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the parts of a copy, which finds its plan by itself."""
+        return {**vars(self), "plan": None, "_where": None}
+
+    @opaque
+    def __call__(self, carry: Tree, now: Tree = (), row: Tree = ()) -> tuple[Tree, Tree]:
+        """The carry after the last step, and the outputs."""
+        leaves, structure = flatten((row, now, carry))
+        if structure != self._structure or tuple(map(form, leaves)) != self._forms:
+            return self._program(carry, now, row, steps=self._steps, every=self._every)
+        return self.run(leaves, carry, now, row)
+
+    def run(self, leaves: Sequence[Any], carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
+        """Run with inputs that are known to fit."""
+        where = ordinary(leaves)
+        if self._refused or not where or self._program.differentiated():
+            return self._program.definition(carry, now, row, steps=self._steps, every=self._every)
+        if where != self._where:
+            given = Given.of(carry, now, row, self._steps)
+            self.plan, self._where = self._planned(given, leaves, where), where
+        if self.plan is None:
+            return self._program.definition(carry, now, row, steps=self._steps, every=self._every)
+        rooms = iter(self.plan(leaves))
+        return unflatten(self._carry, rooms), unflatten(self.plan.structure, rooms)
+
+    def _planned(self, given: Given, leaves: Sequence[Any], where: Where) -> PlannedCall | DeviceCall | None:
+        compiled = self._program.find(given)
+        if compiled is None:
+            return None
+        times = [False] * len(given.row) + [True] * len(given.now) + [False] * len(given.carry)
+        sizes = {"rows": given.rows, "steps": given.times, "every": self._every, "once": len(given.row)}
+        if isinstance(where, bool):
+            return PlannedCall(compiled, leaves, times, **sizes)
+        try:
+            return DeviceCall(compiled, leaves, times, **sizes, where=where)
+        except OSError as error:
+            say(f"programs on {where}", str(error), "no build")
+            return None
