@@ -9,7 +9,7 @@ import itertools
 import mmap
 import os
 import struct
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Hashable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -68,7 +68,7 @@ class _CallRecord(ctypes.Structure):
 class Compiled(NamedTuple):
     """A program for inputs of some shapes and dtypes."""
 
-    call: Callable[..., None]
+    call: Any  # machine code, or the text of a kernel
     table: Tensor
     real: torch.dtype
     carry: tuple[tuple[torch.Size, torch.dtype], ...]  # of one row

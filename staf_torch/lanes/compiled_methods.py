@@ -22,13 +22,15 @@ from torch.compiler import is_exporting
 from torch.utils import _device
 
 from ..signs import Sign
-from .call import PlannedCall, ordinary
+from . import call
+from .call import ordinary
 from .contents import BOUND, Contents
 from .locks import Mutex
 from .loops import tracing_now
 from .one_thread import ENTRIES, alone
 from .opaque import opaque
 from .plain_time import PlainTime
+from .prepared import Plan
 from .program import Program
 from .row_numbers import RowNumbers, over_rows, points_of_rows
 from .shared_programs import shared_program
@@ -374,7 +376,7 @@ class Rows:
             self.program = shared_program(name, step, *parts, copies=copies)
         else:
             self.program = Program(step, name=name, copies=copies)
-        self._plans: dict[Any, PlannedCall] = {}
+        self._plans: dict[Any, Plan] = {}
 
     @property
     def compiled(self) -> bool:
@@ -384,7 +386,7 @@ class Rows:
     def __call__(self, *given: Tensor) -> Tensor:
         """Return y with a dimension of one time after the rows, (B, 1, ...); (n,) is one row."""
         # Shapes alone: the caller has looked at the rest.
-        key = tuple([(x.shape, x.stride(), x.dtype) for x in given])
+        key = tuple([(x.shape, x.stride(), x.dtype, call.processor if x.is_cpu else x.device) for x in given])
         plan = self._plans.get(key)
         if plan is not None:
             return plan(given)[0]
@@ -397,7 +399,7 @@ class Rows:
             self._plans[key] = plan
         return found
 
-    def planned(self, *given: Tensor) -> tuple[PlannedCall | None, Tensor]:
+    def planned(self, *given: Tensor) -> tuple[Plan | None, Tensor]:
         """Return the plan of calls with such inputs, (B, ...), None where the definition runs; and y."""
         prepared = self.program.prepare((), (), tuple(given), steps=1)
         found: Tensor = prepared((), (), tuple(given))[1]

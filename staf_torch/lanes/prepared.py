@@ -14,6 +14,7 @@ from .tree import Tree, flatten, unflatten
 if TYPE_CHECKING:
     from .program import Program
 
+Plan = PlannedCall | DeviceCall
 _log = logging.getLogger(f"{__package__}.program")
 _said: set[tuple[str, str]] = set()  # what has been logged
 
@@ -42,7 +43,7 @@ class Prepared:
         leaves, self._structure = flatten(given.trees())
         self._forms = tuple(map(form, leaves))
         self._carries, self._carry = len(given.carry), given.structures["carry"]
-        self.plan: PlannedCall | DeviceCall | None = None
+        self.plan: Plan | None = None
         self._where: Where | None = None  # of the plan, be there one or not
         self._refused = given.rows == 0 or given.times == 0
 
@@ -71,7 +72,7 @@ class Prepared:
         rooms = iter(self.plan(leaves))
         return unflatten(self._carry, rooms), unflatten(self.plan.structure, rooms)
 
-    def _planned(self, given: Given, leaves: Sequence[Any], where: Where) -> PlannedCall | DeviceCall | None:
+    def _planned(self, given: Given, leaves: Sequence[Any], where: Where) -> Plan | None:
         compiled = self._program.find(given)
         if compiled is None:
             return None

@@ -12,9 +12,9 @@ from torch import Tensor, nn
 from ...approximation.basis import StaFBasis
 from ...centers import Radius, StateFollowingCenters, ball, cross_polytope, rings
 from ...kernels import ExponentialKernel, GaussianKernel, Kernel
-from ...lanes import compiled, each, repeat
-from ...lanes.call import PlannedCall
+from ...lanes import call, compiled, each, repeat
 from ...lanes.compiled_methods import Rows, check_states
+from ...lanes.prepared import Plan
 from ...lanes.row_objects import refuse_rows
 from ...numerics.checks import fail, integer, positive_real, trailing
 from ...numerics.default_device import beside
@@ -248,14 +248,14 @@ class _TwoPrograms:
             "improvement",
         )
 
-        self._one: dict[Any, tuple[Tensor, PlannedCall, PlannedCall]] = {}  # calls with one state
+        self._one: dict[Any, tuple[Tensor, Plan, Plan]] = {}  # calls with one state
 
     @property
     def compiled(self) -> bool:
         return bool(self._one) or (self._roll.compiled and self._improve.compiled)
 
     def __call__(self, x: Tensor) -> Tensor:
-        key = x.shape, x.stride(), x.dtype
+        key = x.shape, x.stride(), x.dtype, call.processor if x.is_cpu else x.device
         one = self._one.get(key)
         if one is not None:  # the plans read where the numbers are, and not in which shape
             u, roll, improve = one

@@ -68,13 +68,12 @@ class DeviceCall:
 
     Attributes:
         structure: of the outputs.
+        direct: whether a call reads nothing of its inputs but their addresses.
         text: of the kernel.
 
     Raises:
         OSError: if the kernel cannot be built or loaded.
     """
-
-    direct = False
 
     def __init__(
         self,
@@ -94,6 +93,7 @@ class DeviceCall:
         times = [*times[:once], *[False] * len(compiled.rows), *times[once:]]
         self._copied: list[int] = []  # inputs without one stride from entry to entry, or from elsewhere
         read = [self._input(k, *given) for k, given in enumerate(zip(leaves, times, strict=True))]
+        self.direct = not self._copied and not any(type(leaf) is Shared for leaf in leaves)
         recorded = -(-steps // every)
         self._rooms = [((rows, *s), (1, *inner_strides(s, rows)), dtype) for s, dtype in compiled.carry]
         for s, dtype in compiled.outputs:
