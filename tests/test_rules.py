@@ -122,7 +122,7 @@ def parametric(**given: Any) -> adp.ParametricPlant:
     return adp.ParametricPlant(regressor, known, **settings)
 
 
-REPORTED = adp.near_optimal(PLANT, COST, dt=0.1)
+REPORTED = adp.near_optimal(PLANT, COST, dt=0.1, horizon=0.4, substeps=1, reach="local")
 WINDOWS, ESTIMATE = adp.IntegralWindows(ACTUATORS, 0.1), adp.LeastSquares([1.0], 0.5)
 
 

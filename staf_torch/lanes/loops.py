@@ -25,7 +25,7 @@ from .tree import Tree, flatten, unflatten
 
 Some = TypeVar("Some")
 _active = threading.local()
-_FEW = 4  # passes of a loop that is only tried
+_FEW = 2  # passes of a loop that is only tried: one feeds the other
 
 
 def repeat(

@@ -295,10 +295,10 @@ class Program(Derived):
         """Return whether a user's step may be traced with a single row, by calls with one row and more."""
         rows = min(given.rows, 2)
         if self._asked < rows and self._of_users is not False:
-            self._asked = rows
+            again, self._asked = not self._asked, rows
             self._of_users = Contents(self.step).of_users
             if self._of_users:
-                self._refused = self._refused or doubt(self.step, given)
+                self._refused = self._refused or doubt(self.step, given, again=again)
             if self._refused is not None:
                 say(self.name, f"its step {self._refused}")
         return self._refused is None

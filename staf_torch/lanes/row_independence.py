@@ -26,26 +26,33 @@ _BITS = (1, -1, 3, -5, 17)  # units in the last place by which inputs are moved
 _CLOSE = 1e-2  # of the largest entry: far above what another order of sums does to an ill-conditioned row
 
 
-def doubt(step: Callable[..., Any], given: Given) -> str | None:
+def doubt(step: Callable[..., Any], given: Given, *, again: bool = True) -> str | None:
     """Return why a step must not be written down with a single row, None where it may.
 
     It is called with one row, again, and with that row beside the one that differs most from it. What draws
     random numbers, counts its calls, reads a clock or takes a mean over the batch gives itself away.
+
+    Args:
+        step: of a program.
+        given: inputs.
+        again: whether to call it twice with the same row; it has been otherwise.
     """
-    first, other = [0], [_farthest(given)]
+    first, other = 0, _farthest(given)
     with undrawn(), torch.no_grad():
-        alone = _called(step, given, first)
-        again = _called(step, given, first)  # the same operations in the same order
-        if len(alone) != len(again) or not all(map(_leaves_are_close, alone, again)):
-            return "gives other numbers when it is called again (random numbers, a counter, a clock?)"
+        alone = _called(step, given, [first])
+        if again:  # the same operations in the same order
+            repeated = _called(step, given, [first])
+            if len(alone) != len(repeated) or not all(map(_leaves_are_close, alone, repeated)):
+                return "gives other numbers when it is called again (random numbers, a counter, a clock?)"
         if given.rows == 1:
             return None
         try:
-            both = _called(step, given, first + other)
+            both = _called(step, given, [first, other])
         except Exception as error:  # which plain torch will raise again, for all rows
             return f"takes one row but not two: {type(error).__name__}: {error}"
-        for rows, part in ((first, slice(0, 1)), (other, slice(1, 2))):
-            if not _alike(step, given, rows, [leaf[part] for leaf in both]):
+        for row, at in ((first, 0), (other, 1)):
+            found = alone if row == first else _called(step, given, [row])
+            if not _alike(step, given, row, found, [leaf[at : at + 1] for leaf in both]):
                 return (
                     "gives a row other numbers beside another row "
                     "(a mean over the batch, a branch on its size?)"
@@ -53,13 +60,14 @@ def doubt(step: Callable[..., Any], given: Given) -> str | None:
     return None
 
 
-def _alike(step: Callable[..., Any], given: Given, rows: Sequence[int], beside: Sequence[Tensor]) -> bool:
+def _alike(
+    step: Callable[..., Any], given: Given, row: int, alone: Sequence[Tensor], beside: Sequence[Tensor]
+) -> bool:
     """Return whether a row alone equals that beside another, as far as rounding lets numbers mean anything.
 
     One row and two are not summed in the same order. What then changes by more than a hundredth, a matrix
     that is singular to rounding, changes with the last bits of the inputs, too, and says nothing.
     """
-    alone = _called(step, given, rows)
     if len(alone) != len(beside):
         return False
     differ = [
@@ -68,7 +76,7 @@ def _alike(step: Callable[..., Any], given: Given, rows: Sequence[int], beside: 
     for bits in _BITS:
         if not differ:
             return True
-        moved = _called(step, given, rows, bits)
+        moved = _called(step, given, [row], bits)
         differ = [k for k in differ if _leaves_are_close(alone[k], moved[k], _CLOSE)]
     return not differ
 
