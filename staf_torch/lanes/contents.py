@@ -21,7 +21,7 @@ import operator
 import pickle
 import sys
 import sysconfig
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from itertools import chain
 from operator import is_
 from pathlib import Path
@@ -53,7 +53,8 @@ _log = logging.getLogger(__name__)
 _said: set[tuple[str, str]] = set()  # what has been logged
 _MISSING = object()
 _EMPTY = object()  # in a cell whose name has no value yet
-_REQUIRES = operator.attrgetter("requires_grad")
+_REQUIRES, _VERSION = operator.attrgetter("requires_grad"), operator.attrgetter("_version")
+_BASE, _ARRAY = operator.itemgetter(*_READ), operator.methodcaller("tobytes")
 BOUND = "_compiled_methods"
 """Attribute in which an object holds its compiled methods: no part of what it is."""
 
@@ -125,18 +126,22 @@ class Contents:
         found = [*map(all_rows, walk.tensors), *walk.others]
         self._changeable = [tensor for tensor in found if not tensor.is_inference()]
         self._versions = [tensor._version for tensor in self._changeable]
-        self._of_inference = [(tensor, version(tensor)) for tensor in found if tensor.is_inference()]
-        self._sets = [(part, set(part)) for part in walk.sets]
-        self._arrays = [(array, array.tobytes()) for array in walk.arrays]
-        # Live views of all containers: what they lead to is compared at once, in ten microseconds a policy.
-        self._sized = [
-            *walk.dicts,
-            *self._users,
-            *walk.lists,
-            *(attributes for attributes, _ in walk.modules),
+        inference = [tensor for tensor in found if tensor.is_inference()]
+        self._rare = [
+            *((version, tensor, version(tensor)) for tensor in inference),
+            *((set, part, set(part)) for part in walk.sets),
+            *((_ARRAY, array, array.tobytes()) for array in walk.arrays),
         ]
+        # Live views of all containers: what they lead to is compared at once, in five microseconds a policy.
+        self._modules = [attributes for attributes, _ in walk.modules]
+        self._sized = [*walk.dicts, *self._users, *walk.lists, *self._modules]
         self._views = [*(part.values() for part in (*walk.dicts, *self._users)), *walk.lists]
+        owners = [(attributes, own) for attributes, own in walk.modules if own]
+        self._owners = [attributes for attributes, _ in owners]
+        self._own = [operator.itemgetter("training", *own) for _, own in owners]
+        self._functions = walk.functions or walk.lookups or walk.cells
         self._lengths, self._inside = [*map(len, self._sized)], [*self._look()]
+        self._bases = [*map(_BASE, self._modules)]
         self._methods = self.methods()
 
     def wants_gradient(self) -> bool:
@@ -159,11 +164,10 @@ class Contents:
             return (
                 [*map(len, self._sized)] == self._lengths
                 and not any(self._walk.empty)
+                and [*map(_BASE, self._modules)] == self._bases  # the same objects: nothing else is compared
                 and all(map(is_, self._look(), self._inside))
-                and [tensor._version for tensor in self._changeable] == self._versions
-                and all(version(tensor) == then for tensor, then in self._of_inference)
-                and all(now == then for now, then in self._sets)
-                and all(now.tobytes() == then for now, then in self._arrays)
+                and [*map(_VERSION, self._changeable)] == self._versions
+                and not (self._rare and any(now(part) != then for now, part, then in self._rare))
                 and not (library and self.replaced(self._methods))
             )
         except (KeyError, RuntimeError):  # an attribute is gone, or comes from another thread meanwhile
@@ -202,15 +206,14 @@ class Contents:
 
     def _look(self) -> Iterator[Any]:
         """Look into all containers, and at what functions read beside."""
+        own = chain.from_iterable(map(operator.call, self._own, self._owners))
+        if not self._functions:
+            return chain(chain.from_iterable(self._views), own)
         walk = self._walk
-        parts: list[Iterable[Any]] = [read(attributes) for attributes, read in walk.modules]
-        if walk.functions or walk.lookups or walk.cells:
-            parts.append(lookup.value for lookup in walk.lookups)
-            parts.append(map(_content_of, walk.cells))
-            parts += (
-                (part.__code__, part.__defaults__) for part in walk.functions
-            )  # an editor may reload them
-        return chain.from_iterable([*self._views, *parts])
+        codes = ((part.__code__, part.__defaults__) for part in walk.functions)  # an editor may reload them
+        read = (lookup.value for lookup in walk.lookups)
+        cells = map(_content_of, walk.cells)
+        return chain(chain.from_iterable(self._views), own, read, cells, chain.from_iterable(codes))
 
 
 def _is_layer(kind: type) -> bool:
@@ -306,7 +309,7 @@ class Walk(pickle.Pickler):
         self.others: list[Tensor] = []  # whose numbers are part of the key
         self.dicts: list[dict[Any, Any]] = []
         self.empty: list[dict[Any, Any]] = []  # most of them the hooks of a module
-        self.modules: list[tuple[dict[str, Any], Callable[[Any], tuple[Any, ...]]]] = []
+        self.modules: list[tuple[dict[str, Any], list[str]]] = []  # attributes, and names of its own ones
         self.lists: list[list[Any]] = []
         self.sets: list[set[Any]] = []
         self.arrays: list[np.ndarray[Any, Any]] = []
@@ -358,7 +361,7 @@ class Walk(pickle.Pickler):
             state |= hooks
             self._states[id(state)] = state
             own = [k for k in vars(value) if k in state and k not in _OF_EVERY_MODULE]
-            self.modules.append((vars(value), operator.itemgetter(*_READ, *own)))
+            self.modules.append((vars(value), own))
             return copyreg.__newobj__, (type(value),), state  # type: ignore[attr-defined]
         if BOUND in getattr(value, "__dict__", ()):
             made = list(value.__reduce_ex__(2))

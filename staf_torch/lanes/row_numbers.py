@@ -15,7 +15,7 @@ import copy
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import torch
 from torch import Tensor
@@ -25,7 +25,7 @@ from .tree import Shared, Tree, flatten, unflatten
 
 Some = TypeVar("Some")
 Resolve = Callable[["RowNumbers"], Tensor]
-_active = threading.local()
+_active, _first = threading.local(), threading.Lock()
 _STRUCTURE = frozenset(
     [
         "dim",
@@ -117,10 +117,15 @@ class RowNumbers(Tensor):
 
     full: Tensor
     made = False  # whether a process has any
+    prepare: ClassVar[list[Callable[[], None]]] = []  # called before the first is made
 
     @staticmethod
     def __new__(cls, full: Tensor) -> RowNumbers:
-        RowNumbers.made = True
+        if not RowNumbers.made:
+            with _first:
+                for each in RowNumbers.prepare if not RowNumbers.made else ():
+                    each()
+                RowNumbers.made = True
         one = full.detach()[0]
         numbers: RowNumbers = Tensor._make_wrapper_subclass(
             cls, one.shape, strides=one.stride(), dtype=full.dtype, device=full.device, requires_grad=False

@@ -11,6 +11,8 @@ from __future__ import annotations
 import abc
 import functools
 import inspect
+import threading
+import weakref
 from collections.abc import Callable, Sequence
 from types import CellType, FunctionType, MethodType
 from typing import Any, ParamSpec, TypeVar
@@ -112,15 +114,17 @@ class Rowwise(abc.ABCMeta):
     A class says in ``rowwise`` which of its methods, and of those of its subclasses, are functions of points:
     by the name, how many dimensions each argument has without rows. Called with numbers of rows by somebody
     who has not said whose, such a method takes arguments (B, ...) row by row; one without rows is for all.
+    Until a process has numbers of rows its methods are as they were written: there a call asks nothing.
     """
 
     def __new__(mcs, name: str, bases: tuple[type, ...], space: dict[str, Any], **more: Any) -> Any:
         known = [space.get("rowwise", {}), *(getattr(base, "rowwise", {}) for base in bases)]
         rowwise = {key: dims for each in reversed(known) for key, dims in each.items()}
-        for key, dims in rowwise.items():
-            if isinstance(space.get(key), FunctionType):
-                space[key] = _of_points(space[key], dims)
-        return super().__new__(mcs, name, bases, {**space, "rowwise": rowwise}, **more)
+        made: Any = super().__new__(mcs, name, bases, {**space, "rowwise": rowwise}, **more)
+        _unserved.add(made)
+        if RowNumbers.made:
+            _serve_rows()
+        return made
 
 
 class OfRows(Rowwise):
@@ -128,25 +132,45 @@ class OfRows(Rowwise):
 
     @property
     def __signature__(cls) -> inspect.Signature:
-        """That of the constructor, for Hydra and editors, not that of `__call__` below."""
+        """That of the constructor, for Hydra and editors, not that of `_made_with_rows`."""
         whole = inspect.signature(cls.__init__)  # type: ignore[misc]
         return whole.replace(parameters=list(whole.parameters.values())[1:])
 
-    def __call__(cls: type[Some], *args: Any, **kwargs: Any) -> Some:
-        make: Callable[..., Some] = super().__call__  # type: ignore[misc]
-        if not RowNumbers.made or not in_use():
-            return make(*args, **kwargs)
-        if not _holds_rows((args, kwargs)):
-            return made_by_rows(lambda: make(*args, **kwargs))
-        try:
-            return make(*args, **kwargs)  # with all rows at once
-        except (ValueError, TypeError, RuntimeError):  # it decides by values, or takes no tensors
-            pass
 
-        def one() -> Some:
-            return make(*map(_alone, args), **{name: _alone(value) for name, value in kwargs.items()})
+def _made_with_rows(cls: type[Some], *args: Any, **kwargs: Any) -> Some:
+    """Make an object of a class of `OfRows`: with numbers of rows for all rows at once, or row by row."""
+    make: Callable[..., Some] = functools.partial(type.__call__, cls)
+    if not in_use():
+        return make(*args, **kwargs)
+    if not _holds_rows((args, kwargs)):
+        return made_by_rows(lambda: make(*args, **kwargs))
+    try:
+        return make(*args, **kwargs)  # with all rows at once
+    except (ValueError, TypeError, RuntimeError):  # it decides by values, or takes no tensors
+        pass
 
-        return made_by_rows(one)
+    def one() -> Some:
+        return make(*map(_alone, args), **{name: _alone(value) for name, value in kwargs.items()})
+
+    return made_by_rows(one)
+
+
+_unserved: weakref.WeakSet[Any] = weakref.WeakSet()  # classes of `Rowwise` whose methods are as written
+_serving = threading.Lock()
+
+
+def _serve_rows() -> None:
+    """Have methods of points and constructors look for numbers of rows, of which there are some now."""
+    with _serving:
+        OfRows.__call__ = _made_with_rows  # type: ignore[method-assign, assignment]
+        while _unserved:
+            kind = _unserved.pop()
+            for key, dims in kind.rowwise.items():
+                if isinstance(method := vars(kind).get(key), FunctionType):
+                    setattr(kind, key, _of_points(method, dims))
+
+
+RowNumbers.prepare.append(_serve_rows)
 
 
 def _of_points(method: Any, dims: Sequence[int]) -> Any:
@@ -156,7 +180,7 @@ def _of_points(method: Any, dims: Sequence[int]) -> Any:
 
     @functools.wraps(method)
     def of_points(self: Any, *args: Any, **kwargs: Any) -> Any:
-        if not RowNumbers.made or not in_use():  # the first for speed
+        if not in_use():
             return method(self, *args, **kwargs)
         if kwargs:
             bound = signature.bind(self, *args, **kwargs)

@@ -47,24 +47,34 @@ def real(call: str, name: str, value: object) -> float:
 
 def positive(call: str, name: str, value: object) -> Tensor:
     """A positive number or tensor of them, as a floating-point tensor (float64 from a number)."""
-    checked = number(call, name, value)
-    tensor = torch.as_tensor(
-        checked,
-        dtype=None if isinstance(checked, Tensor) else torch.float64,
-        device=getattr(checked, "device", "cpu"),
-    )
-    return _in_all_rows(call, name, tensor, lambda x: x > 0, "must be positive", value)
+    return _tensor(_signed(call, name, number(call, name, value), "positive", value))
 
 
 def non_negative(call: str, name: str, value: object) -> Tensor:
     """Like `positive`, zero allowed."""
-    checked = number(call, name, value)
-    tensor = torch.as_tensor(
-        checked,
-        dtype=None if isinstance(checked, Tensor) else torch.float64,
-        device=getattr(checked, "device", "cpu"),
-    )
-    return _in_all_rows(call, name, tensor, lambda x: x >= 0, "must not be negative", value)
+    return _tensor(_signed(call, name, number(call, name, value), "not negative", value))
+
+
+_SIGNS: dict[str, tuple[Callable[[Any], Any], str]] = {
+    "positive": (lambda x: x > 0, "must be positive"),
+    "not negative": (lambda x: x >= 0, "must not be negative"),
+}
+
+
+def _signed(call: str, name: str, checked: float | Tensor, sign: str, value: object) -> float | Tensor:
+    """Return a number or a tensor of them whose sign is right; ``value`` is what was given."""
+    holds, rule = _SIGNS[sign]
+    if isinstance(checked, Tensor):
+        return _in_all_rows(call, name, checked, holds, rule, value)
+    if not holds(checked):
+        raise fail(call, name, rule, value)
+    return checked
+
+
+def _tensor(checked: float | Tensor) -> Tensor:
+    if isinstance(checked, Tensor):
+        return checked
+    return torch.tensor(checked, dtype=torch.float64, device="cpu")
 
 
 def _in_all_rows(
@@ -92,9 +102,7 @@ def own_number(call: str, name: str, value: object, sign: str = "any") -> Any:
     checked = number(call, name, value)
     if isinstance(checked, Tensor) and checked.dim():
         raise fail(call, name, "must be one number, or one a row by `rows`", value)
-    if sign != "any":
-        (positive if sign == "positive" else non_negative)(call, name, checked)
-    return checked
+    return checked if sign == "any" else _signed(call, name, checked, sign, value)
 
 
 def keep(module: nn.Module, name: str, value: Any) -> Any:
