@@ -1,6 +1,7 @@
 """Row programs: torch functions of one row, compiled with a row in every vector lane."""
 
 from . import device as device
+from .adjoint import gradient_memory as gradient_memory
 from .compiled_methods import compiled as compiled
 from .compiled_methods import compiling as compiling
 from .compiled_methods import ready as ready
@@ -22,6 +23,7 @@ __all__ = [
     "compiling",
     "device",
     "each",
+    "gradient_memory",
     "ready",
     "reduce",
     "repeat",

@@ -7,6 +7,7 @@ import ctypes
 import functools
 import itertools
 import mmap
+import operator
 import os
 import struct
 from collections.abc import Hashable, Sequence
@@ -89,11 +90,7 @@ def ordinary(leaves: Sequence[Any]) -> Where:
     or one CUDA device. Under a tracer, a transform of torch.func or another mode the operations themselves
     are wanted.
     """
-    if (
-        torch._C._functorch.peek_interpreter_stack() is not None
-        or forward_ad._current_level >= 0
-        or torch._C._len_torch_dispatch_stack()
-    ):
+    if seen_by_others():
         return False
     recorded = torch.is_grad_enabled()
     for leaf in leaves:
@@ -118,6 +115,15 @@ def _one_device(leaves: Sequence[Any]) -> Where:
     return where if not found and where.type == "cuda" else False
 
 
+def seen_by_others() -> bool:
+    """Return whether a tracer, a transform of torch.func or forward mode looks at the operations."""
+    return (
+        torch._C._functorch.peek_interpreter_stack() is not None
+        or forward_ad._current_level >= 0
+        or torch._C._len_torch_dispatch_stack() > 0
+    )
+
+
 _TENSORS = (Tensor, torch.nn.Parameter)
 
 
@@ -138,6 +144,7 @@ class PlannedCall:
         times: for each of them, whether a dimension of times comes first (after the rows).
         rows, steps, every: of the call.
         once: how many of the leaves a row has once.
+        backwards: whether times are read and written from the last to the first.
 
     Attributes:
         structure: of the outputs.
@@ -154,6 +161,7 @@ class PlannedCall:
         steps: int,
         every: int,
         once: int = 0,
+        backwards: bool = False,
     ) -> None:
         self._compiled, self.structure, self._rows_and_times = compiled, compiled.structure, rows * steps
         self._rows, self._once = rows, once
@@ -178,6 +186,7 @@ class PlannedCall:
         ]
         slots += [_Slot(1, time, rows, entries) for _, _, entries, time in (*ends, *histories)]
         real = compiled.real
+        self._late = self._reverse(slots, steps, recorded) if backwards else None
         self._rooms = [(shape, strides) for shape, strides, _, _ in (*ends, *histories)]
         self._dtypes = [
             (k, dtype) for k, (_, dtype) in enumerate((*compiled.carry, *compiled.outputs)) if dtype != real
@@ -191,6 +200,18 @@ class PlannedCall:
         self._call = _CallRecord(rows, steps, every, compiled.table.data_ptr(), ctypes.addressof(self._slots))
         self._call.parallel = _parallel()
         self._reference = ctypes.addressof(self._call)
+
+    def _reverse(self, slots: list[_Slot], steps: int, recorded: int) -> list[int]:
+        """Turn the times of all slots around; return the bytes from an address to that of the last time."""
+        inputs, size = (
+            len(slots) - len(self._compiled.carry) - len(self._compiled.outputs),
+            self._compiled.real.itemsize,
+        )
+        late = []
+        for k, slot in enumerate(slots):
+            late.append(((steps if k < inputs else recorded) - 1) * slot.time * size)
+            slot.time = -slot.time
+        return late
 
     def _input(self, k: int, leaf: Any, timed: bool) -> _Slot:
         shared, tensor = type(leaf) is Shared, plain(leaf)
@@ -222,7 +243,11 @@ class PlannedCall:
         for k in self._large:
             shape, strides = self._rooms[k]
             rooms[k] = fresh(self._like, torch.Size(shape).numel()).as_strided(shape, strides)
-        addresses = self._packed(*map(_address, given), *map(_address, rooms))
+        if self._late is None:
+            addresses = self._packed(*map(_address, given), *map(_address, rooms))
+        else:
+            starts = map(_address, (*given, *rooms))
+            addresses = self._packed(*map(operator.add, starts, self._late))
         if self._rows_and_times < _MANY:
             self._compiled.call(self._reference, addresses, torch.get_num_threads())
         else:

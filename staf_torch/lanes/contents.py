@@ -125,6 +125,7 @@ class Contents:
         self._library = [vars(kind) for kind in classes if not is_users(kind)]
         found = [*map(all_rows, walk.tensors), *walk.others]
         self._changeable = [tensor for tensor in found if not tensor.is_inference()]
+        self._structural = [(tensor, tensor._version) for tensor in walk.others if not tensor.is_inference()]
         self._versions = [tensor._version for tensor in self._changeable]
         inference = [tensor for tensor in found if tensor.is_inference()]
         self._rare = [
@@ -172,6 +173,14 @@ class Contents:
             )
         except (KeyError, RuntimeError):  # an attribute is gone, or comes from another thread meanwhile
             return False
+
+    def renewed(self) -> bool:
+        """Return whether floating-point numbers alone have changed; they count from now on."""
+        then, self._versions = self._versions, [tensor._version for tensor in self._changeable]
+        if self.unchanged(library=False) and all(t._version == v for t, v in self._structural):
+            return True
+        self._versions = then
+        return False
 
     def methods(self) -> list[Any]:
         """Return what is in the library's classes that were come upon, and in their bases."""

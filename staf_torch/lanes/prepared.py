@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from .call import Given, PlannedCall, Where, form, ordinary, whole
+import torch
+
+from .adjoint import GradientCall
+from .call import Given, PlannedCall, Where, form, ordinary, seen_by_others, whole
 from .device.kernel import DeviceCall
+from .log import say
 from .opaque import opaque
 from .tree import Tree, flatten, unflatten
 
@@ -15,17 +18,6 @@ if TYPE_CHECKING:
     from .program import Program
 
 Plan = PlannedCall | DeviceCall
-_log = logging.getLogger(f"{__package__}.program")
-_said: set[tuple[str, str]] = set()  # what has been logged
-
-
-def say(name: str, reason: str, kind: str | None = None) -> None:
-    """Log why a program runs in plain torch, once for a reason or a kind of reasons."""
-    reason = " ".join(reason.split())[:600]
-    told = name, reason if kind is None else kind
-    if told not in _said:
-        _said.add(told)
-        _log.warning("%s runs in plain torch, slower: %s", name, reason)
 
 
 class Prepared:
@@ -45,11 +37,12 @@ class Prepared:
         self._carries, self._carry = len(given.carry), given.structures["carry"]
         self.plan: Plan | None = None
         self._where: Where | None = None  # of the plan, be there one or not
+        self._gradient: GradientCall | None = None
         self._refused = given.rows == 0 or given.times == 0
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the parts of a copy, which finds its plan by itself."""
-        return {**vars(self), "plan": None, "_where": None}
+        return {**vars(self), "plan": None, "_where": None, "_gradient": None}
 
     @opaque
     def __call__(self, carry: Tree, now: Tree = (), row: Tree = ()) -> tuple[Tree, Tree]:
@@ -63,14 +56,29 @@ class Prepared:
         """Run with inputs that are known to fit."""
         where = ordinary(leaves)
         if self._refused or not where or self._program.differentiated():
-            return self._program.definition(carry, now, row, steps=self._steps, every=self._every)
+            return self._otherwise(leaves, carry, now, row)
         if where != self._where:
             given = Given.of(carry, now, row, self._steps)
-            self.plan, self._where = self._planned(given, leaves, where), where
+            self._program.reads()
+            if not self._program.differentiated():
+                self.plan, self._where = self._planned(given, leaves, where), where
+            if self._program.differentiated():
+                return self._otherwise(leaves, carry, now, row)
         if self.plan is None:
             return self._program.definition(carry, now, row, steps=self._steps, every=self._every)
         rooms = iter(self.plan(leaves))
         return unflatten(self._carry, rooms), unflatten(self.plan.structure, rooms)
+
+    def _otherwise(self, leaves: Sequence[Any], carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
+        """Run with gradients, or by the definition where no compiled code serves."""
+        if not self._refused and torch.is_grad_enabled() and not seen_by_others():
+            if self._gradient is None:
+                given = Given.of(carry, now, row, self._steps)
+                self._gradient = GradientCall(self._program, given, self._every)
+            found = self._gradient(leaves)
+            if found is not None:
+                return found
+        return self._program.definition(carry, now, row, steps=self._steps, every=self._every)
 
     def _planned(self, given: Given, leaves: Sequence[Any], where: Where) -> Plan | None:
         compiled = self._program.find(given)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
-from typing import Any, NamedTuple
+import operator
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
 from ..signs import Sign
 from . import cache
+from .adjoint_steps import keeping_step
 from .cache import Trace
 from .call import Compiled, Given, form, ordinary
 from .compiler import machine_code
@@ -17,10 +19,11 @@ from .contents import Contents, Derived
 from .emit.c import Names, c_text
 from .emit.cpp import emit
 from .locks import Mutex
+from .log import say
 from .loops import scan, tracing_now
 from .one_thread import ENTRIES, alone
 from .opaque import opaque
-from .prepared import Prepared, say
+from .prepared import Prepared
 from .row_independence import doubt, undrawn
 from .row_numbers import RowNumbers, over_rows, points_of_rows
 from .texts import Form, kernel, written
@@ -28,6 +31,7 @@ from .trace.step import Step, trace
 from .trace.tracer import NotLoweredError
 from .tree import Shared, Tree, flatten, labels, plain, unflatten
 
+Some = TypeVar("Some", bound=Tensor)
 _FEW = 8  # rows that one vector holds
 _LONGEST = 20_000  # lines that a compiler is asked to take: half a minute
 _PREPARED = 64  # calls of other shapes that a program remembers
@@ -52,7 +56,8 @@ class Program(Derived):
     The definition is plain torch: ``step`` with all rows, time after time. The compiled program runs ``step``
     once with a single row, (1, ...), writes down what it does as a scalar program and computes that with a
     row in every vector lane. Where that cannot be done, one line of the log says why and the definition runs;
-    so it does where a derivative is wanted or a tensor is not on the CPU.
+    so it does where a transform of torch looks at it. What has ``requires_grad``, inputs and tensors that
+    ``step`` reads, gets its gradient from a second such program (`GRADIENTS.md`).
 
     What a function ``step`` finds elsewhere (globals, closures, tensors and attributes there) may change
     between calls: the program is then made anew. A constant is what cannot be watched (an object without a
@@ -69,9 +74,12 @@ class Program(Derived):
     def __init__(self, step: Step, *, name: str = "program", compile: bool = True, copies: int = 0) -> None:
         self.step, self.name, self.compile, self.copies = step, name, compile, copies
         self._lock = Mutex()  # of what is built: one thread builds, the others wait for it
-        self._compiled: dict[Hashable, _Built | None] = {}
+        self._compiled: dict[Hashable, Built | None] = {}
         self._prepared: dict[Hashable, Prepared] = {}
         self._model: tuple[Program, Mapping[int, Tensor]] | None = None
+        self._builds = False  # whether that is built first, if it was not
+        self._followers: dict[Hashable, Program] = {}  # of steps that are made from this one
+        self._tensors: Sequence[Tensor] = ()  # that the step reads, as far as is known
         self._described: tuple[bytes, Sequence[Tensor]] | None = None
         self._read: Contents | None = None  # what the step reads, once it is compiled
         self._watched = True  # whether a change there is looked for
@@ -98,7 +106,7 @@ class Program(Derived):
             by: tells steps apart, in any process, that differ in more than tensors; None where nothing does.
             tensors: all floating-point tensors that the step reads.
         """
-        self._described = None if by is None else (by, tensors)
+        self._described, self._tensors = None if by is None else (by, tensors), tensors
         self._of_users, self._watched = (None if by is None else False), False
 
     def with_others(self, step: Step, others: Sequence[tuple[Tensor, Tensor]]) -> Program:
@@ -277,6 +285,11 @@ class Program(Derived):
 
     def find(self, given: Given) -> Compiled | None:
         """The compiled program for such inputs, None where there is none."""
+        built = self.built(given)
+        return None if built is None or not self._alone(given) else built.compiled
+
+    def built(self, given: Given) -> Built | None:
+        """What was built for such inputs, None where there is nothing."""
         where = given.ordinary()
         if not self.compile or not where:
             return None
@@ -287,9 +300,52 @@ class Program(Derived):
             torch.device("cpu" if where is True else where),
         ):  # what the step makes is where its inputs are, not on a default device
             if key not in self._compiled:
-                self._compiled[key] = self._again(key) or self._build(given, form)
-            built = self._compiled[key]
-            return None if built is None or not self._alone(given) else built.compiled
+                built = self._compiled[key] = self._again(key, given) or self._build(given, form)
+                if built is not None:
+                    read = (*self._tensors, *built.trace.recipe.found, *built.trace.rows)
+                    self._tensors = [*{id(t): t for t in map(self.in_place_of, read)}.values()]
+            return self._compiled[key]
+
+    def in_place_of(self, tensor: Some) -> Some:
+        """Return the tensor that stands where the program that this one follows had another, or itself."""
+        found: Any = tensor if self._model is None else self._model[1].get(id(tensor), tensor)
+        return found
+
+    def keeping(self, given: Given) -> tuple[Program, Built] | None:
+        """Return the program that also puts out the carry before every step, and what was built of it."""
+        if not given.ordinary() or not self._alone(given):
+            return None
+        program = self.follower("keeping", lambda of: keeping_step(of.step), follows=True)
+        built = program.built(given)
+        return None if built is None else (program, built)
+
+    def follower(self, kind: Hashable, step_of: Callable[[Program], Step], *, follows: bool) -> Program:
+        """Return the program of a step that is made from this one's.
+
+        Args:
+            kind: of it.
+            step_of: makes it from a program.
+            follows: whether it may be traced where the program was that this one follows.
+        """
+        with self._lock:
+            if kind not in self._followers:
+                new = Program(step_of(self), name=self.name, copies=self.copies)
+                new._of_users, new._watched = False, False
+                if self._model is not None and follows:
+                    model, others = self._model
+                    new._model, new._builds = (model.follower(kind, step_of, follows=True), others), True
+                if self._described is not None:
+                    by, tensors = self._described
+                    new.described(by + repr(kind).encode(), tensors)
+                self._followers[kind] = new
+            return self._followers[kind]
+
+    def reads(self) -> Sequence[Tensor]:
+        """Return the tensors that the step reads, as far as is known: all of them once it is compiled."""
+        if self._read is None and self._watched:
+            self._read = Contents(self.step)
+            self._tensors = self._read.tensors
+        return self._tensors
 
     def _alone(self, given: Given) -> bool:
         """Return whether a user's step may be traced with a single row, by calls with one row and more."""
@@ -305,7 +361,7 @@ class Program(Derived):
 
     def differentiated(self) -> bool:
         """Return whether a gradient by a tensor that the step found elsewhere is wanted."""
-        return self._read is not None and self._read.wants_gradient()
+        return torch.is_grad_enabled() and any(map(_REQUIRES, self._tensors))
 
     def _look_around(self) -> None:
         """Forget what was compiled of a step that now reads something else."""
@@ -313,31 +369,49 @@ class Program(Derived):
         if read is None or read.unchanged(library=False):
             return
         with self._lock:
-            if self._read is read:  # and no other thread has looked meanwhile
-                self._compiled, self._prepared = {}, {}
-                self._read = self._model = self._refused = None
-                self._asked = 0
+            if self._read is not read:  # another thread has looked meanwhile
+                return
+            self._prepared = {}
+            if read.renewed() and self._renew():
+                return
+            self._compiled, self._followers, self._tensors = {}, {}, ()
+            self._read = self._model = self._refused = None
+            self._asked = 0
 
-    def _again(self, key: Hashable) -> _Built | None:
+    def _renew(self) -> bool:
+        """Read the numbers of all tables again; return whether nothing else has changed."""
+        for key, built in self._compiled.items():
+            if built is not None:
+                found = built.trace.recipe.found
+                again = self._with_others(built, {id(t): self.in_place_of(t) for t in found})
+                if again is None:
+                    return False
+                self._compiled[key] = again
+        return all(follower._renew() for follower in self._followers.values())
+
+    def _again(self, key: Hashable, given: Given) -> Built | None:
         """The program of the model with a table of other numbers, None where that cannot be."""
         if self._model is None:
             return None
         model, others = self._model
-        built = model._compiled.get(key)
-        numbers = None if built is None else built.trace.recipe.again(others)
-        if built is None or numbers is None:
+        built = model.built(given) if self._builds else model._compiled.get(key)
+        again = None if built is None else self._with_others(built, others)
+        return None if again is None else again._replace(followed=True)
+
+    def _with_others(self, built: Built, others: Mapping[int, Tensor]) -> Built | None:
+        """What was built with a table of the numbers of other tensors, None where the text is another."""
+        numbers = built.trace.recipe.again(others)
+        if numbers is None:
             return None
         table = built.trace.text.numbers(numbers, built.compiled.real)
-        given = [others.get(id(each), each) for each in built.trace.rows]
+        given = [self.in_place_of(each) for each in built.trace.rows]
         rows = tuple(each for each in given if isinstance(each, RowNumbers))
         if len(rows) < len(given):
             return None
-        compiled = built.compiled._replace(table=table, rows=rows)
-        return built._replace(compiled=compiled)
+        return built._replace(compiled=built.compiled._replace(table=table, rows=rows))
 
-    def _build(self, given: Given, form: Form) -> _Built | None:
-        if self._read is None and self._watched:
-            self._read = Contents(self.step)
+    def _build(self, given: Given, form: Form) -> Built | None:
+        self.reads()
         try:
             with undrawn(), Sign(f"compiling {self.name}"):
                 made = self._known(given, form)
@@ -354,7 +428,7 @@ class Program(Derived):
             self._read.warn(self.name)
         table = made.text.numbers(made.recipe.values, made.real)
         shapes = tuple((leaf.shape[1:], leaf.dtype) for leaf in given.carry)
-        return _Built(Compiled(call, table, made.real, shapes, made.outputs, made.structure, made.rows), made)
+        return Built(Compiled(call, table, made.real, shapes, made.outputs, made.structure, made.rows), made)
 
     def _known(self, given: Given, form: Form) -> Trace:
         """Return the trace of the step with a single row, from the cache where it has been traced before."""
@@ -376,6 +450,18 @@ def _loops_over(now: Tree) -> bool:
     return bool(leaves) and not any(isinstance(leaf, Shared) for leaf in leaves)
 
 
-class _Built(NamedTuple):
+class Built(NamedTuple):
+    """The record of a program that was built.
+
+    Args:
+        compiled: the program.
+        trace: from which it was made.
+        followed: whether the trace is of the program that this one follows.
+    """
+
     compiled: Compiled
     trace: Trace
+    followed: bool = False
+
+
+_REQUIRES = operator.attrgetter("requires_grad")

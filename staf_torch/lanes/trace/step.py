@@ -92,8 +92,7 @@ def trace(step: Step, given: Given, *, widened: bool = False, folded: bool = Fal
         NotLoweredError: if an operation has no scalar form.
     """
     graph = Graph(given.real == torch.float32 and not widened)
-    learning = torch.is_grad_enabled()
-    tracer = Tracer(graph, lower, learning=learning, widened=widened, folded=folded)
+    tracer = Tracer(graph, lower, widened=widened, folded=folded)
 
     def inputs(op: str, leaves: Sequence[Any], depth: int, times: int) -> list[Tensor]:
         traced = []

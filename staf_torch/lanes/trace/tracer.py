@@ -67,16 +67,13 @@ class Tracer(TorchDispatchMode):
     Args:
         graph: written.
         lower: the nodes of what an operation returns, `step.lower`.
-        learning: whether somebody may want a derivative with respect to a constant.
         widened: whether the numbers of a float32 program are carried in double.
         folded: whether the numbers of captured tensors become part of the text.
     """
 
-    def __init__(
-        self, graph: Graph, lower: Callable[..., Any], *, learning: bool, widened: bool, folded: bool
-    ) -> None:
+    def __init__(self, graph: Graph, lower: Callable[..., Any], *, widened: bool, folded: bool) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
-        self.graph, self._lower, self._learning, self._widened = graph, lower, learning, widened
+        self.graph, self._lower, self._widened = graph, lower, widened
         self.captured, self._folded = Captured(), folded
         self.inside = 0  # loops around what is traced now
         self._storages: dict[int, tuple[Any, Ids]] = {}  # keeps the storages: an address is used once
@@ -267,9 +264,6 @@ class Tracer(TorchDispatchMode):
     ) -> Any:
         kwargs = kwargs or {}
         tensors = _tensors((args, kwargs))
-        wanted = [t for t in tensors if t.requires_grad and not self.traced(t)] if self._learning else []
-        if any(self.captured.from_outside(tensor) for tensor in wanted):
-            raise NotLoweredError("a derivative with respect to a constant of the program may be wanted")
         name, draws, writes = _facts(func)
         if draws and not _own_generator(args, kwargs):
             raise NotLoweredError(f"`{func}` draws random numbers", "random")

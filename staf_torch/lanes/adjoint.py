@@ -1,0 +1,265 @@
+"""Gradients of a row program: forward compiled, backward by a second program, the adjoint of the step.
+
+Where steps are long, the forward pass keeps the carry before every one of them; where they are short, and
+memory is slower than arithmetic, the backward pass computes it again (`backward`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from .adjoint_steps import Substituted
+from .backward import Backward, split
+from .call import Compiled, Given, PlannedCall
+from .device.kernel import DeviceCall
+from .log import say
+from .row_numbers import RowNumbers, columns
+from .tree import Shared, flatten, plain, unflatten
+
+if TYPE_CHECKING:
+    from .program import Built, Program
+
+_WORTH = 10  # operations of a step for each byte of its carry: kept, it costs less than the step again
+Plan = PlannedCall | DeviceCall
+_PLANS = 64  # calls of other shapes that are remembered
+_MEBIBYTE = 2**20
+_budget = 256 * _MEBIBYTE
+
+
+@contextlib.contextmanager
+def gradient_memory(mebibytes: float) -> Iterator[None]:
+    """Let the gradient of a call keep so much memory within the block; 256 MiB by default.
+
+    What does not fit is computed again by the backward pass, at one or two more forward passes.
+
+    Example:
+        >>> with lanes.gradient_memory(64):
+        ...     loss(program).backward()
+
+        Shown by `staf_torch/lanes/GRADIENTS.md`.
+
+    Args:
+        mebibytes: of the whole process.
+
+    Raises:
+        ValueError: if it is not positive.
+    """
+    global _budget
+    if not mebibytes > 0:
+        raise ValueError(f"`gradient_memory(mebibytes=...)` must be positive; got {mebibytes!r}.")
+    before, _budget = _budget, int(mebibytes * _MEBIBYTE)
+    try:
+        yield
+    finally:
+        _budget = before
+
+
+class Ran(NamedTuple):
+    """What the backward pass of one call must know beside its tensors.
+
+    Args:
+        call: that was made.
+        built: of the program that keeps carries.
+        order: what the step reads, in an order that all processes share.
+        found: places of the captured tensors with a gradient among those that the trace found.
+        captured: these tensors.
+        numbers: of rows that the step reads.
+        versions: of what the step reads and has no gradient.
+        kept: whether the forward pass keeps the carries.
+        budget: bytes.
+    """
+
+    call: GradientCall
+    built: Built
+    order: dict[int, int]
+    found: tuple[int, ...]
+    captured: tuple[Tensor, ...]
+    numbers: tuple[RowNumbers, ...]
+    versions: tuple[tuple[Tensor, int], ...]
+    kept: bool
+    budget: int
+
+
+class GradientCall:
+    """A call of a program of which gradients are wanted, for inputs of fixed forms.
+
+    Args:
+        program: that is called.
+        given: inputs of such forms.
+        every: times from one recorded output to the next.
+
+    Attributes:
+        sizes: how many inputs a row has once, how many come at every time, and how many are the carry.
+    """
+
+    def __init__(self, program: Program, given: Given, every: int) -> None:
+        self.program, self.every, self.rows, self.times = program, every, given.rows, given.times
+        self.structures = given.structures
+        self.sizes = len(given.row), len(given.now), len(given.carry)
+        self._shared = [isinstance(leaf, Shared) for leaf in (*given.row, *given.now, *given.carry)]
+        self._plans: dict[Any, tuple[Compiled, Plan]] = {}
+        self._refused = False
+
+    def __call__(self, leaves: Sequence[Any]) -> tuple[Any, Any] | None:
+        """Return the carry and the outputs, None where the definition must compute them.
+
+        Args:
+            leaves: what a row has once, what times bring, the carry.
+        """
+        if self._refused or not self.program.compile:
+            return None
+        tensors = [plain(leaf) for leaf in leaves]
+        keeping = self.program.keeping(self.given([tensor.detach() for tensor in tensors]))
+        if keeping is None:
+            return None
+        ran = self._ran(*keeping)
+        own = columns(ran.numbers, self.rows)
+        rooms = iter(_Gradient.apply(ran, *tensors, *ran.captured, *own))  # type: ignore[no-untyped-call]
+        outputs = ran.built.compiled.structure[1][0]  # beside them it has the carries
+        return unflatten(self.structures["carry"], rooms), unflatten(outputs, rooms)
+
+    def _ran(self, keeping: Program, built: Built) -> Ran:
+        read = [keeping.in_place_of(tensor) for tensor in built.trace.recipe.found]
+        found = tuple(k for k, tensor in enumerate(read) if tensor.requires_grad)
+        fixed = [t for t in read if not (t.requires_grad or t.is_inference())]
+        work = re.search(r"WORK_STEP = (\d+)", built.trace.text.source)
+        size = carried(built.compiled)
+        pays = work is None or int(work[1]) > _WORTH * size
+        return Ran(
+            call=self,
+            built=built,
+            order={id(tensor): k for k, tensor in enumerate(keeping.reads())},
+            found=found,
+            captured=tuple(read[k] for k in found),
+            numbers=built.compiled.rows,
+            versions=tuple((tensor, tensor._version) for tensor in fixed),
+            kept=pays and self.every == 1 and size * self.rows * self.times <= _budget,
+            budget=_budget,
+        )
+
+    def given(self, tensors: Sequence[Tensor]) -> Given:
+        """Return the inputs of the program, of flat ones."""
+        leaves = [Shared(x) if shared else x for x, shared in zip(tensors, self._shared, strict=True)]
+        row, now, carry = split(leaves, self.sizes)
+        return Given(carry, now, row, self.structures, self.rows, self.times)
+
+    def run(self, built: Built, given: Given, own: Sequence[Tensor], every: int, back: bool) -> list[Tensor]:
+        """Run a program on inputs, with the columns of rows' numbers among them; return what it returns."""
+        where = given.ordinary()
+        nows = given.now if where is True or not back else [flipped(leaf) for leaf in given.now]
+        leaves = [*given.row, *own, *nows, *given.carry]
+        forms = tuple([(x.shape, x.stride(), x.dtype) for x in map(plain, leaves)])
+        key = id(built.trace), forms, given.times, every
+        compiled, plan = self._plans.get(key, (None, None))
+        if plan is None or compiled is not built.compiled:
+            if len(self._plans) >= _PLANS:
+                self._plans.clear()
+            timed = [*[False] * (len(given.row) + len(own)), *[True] * len(nows), *[False] * len(given.carry)]
+            alone, sizes = built.compiled._replace(rows=()), {"rows": given.rows, "steps": given.times}
+            if isinstance(where, bool):
+                plan = PlannedCall(alone, leaves, timed, **sizes, every=every, backwards=back)
+            else:
+                plan = DeviceCall(alone, leaves, timed, **sizes, every=every, once=0, where=where)
+            self._plans[key] = built.compiled, plan
+        rooms, carries = plan(leaves), len(given.carry)
+        return rooms if where is True or not back else [*rooms[:carries], *map(flipped, rooms[carries:])]
+
+    def forward(self, ran: Ran, tensors: Sequence[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
+        """Return the carry with the outputs, and the carries that are kept."""
+        given = self.given(tensors[: sum(self.sizes)])
+        own = tensors[len(tensors) - len(ran.numbers) :]
+        fewer = None if ran.kept else self.program.built(given)
+        rooms = self.run(fewer or ran.built, given, own, self.every, back=False)
+        if fewer is not None:
+            return rooms, []
+        end = len(rooms) - self.sizes[2]
+        return rooms[:end], rooms[end:] if ran.kept else []
+
+    def backward(
+        self,
+        ran: Ran,
+        tensors: Sequence[Tensor],
+        kept: Sequence[Tensor],
+        needs: Sequence[bool],
+        ends: Sequence[Tensor | None],
+    ) -> list[Tensor | None]:
+        """Return the gradients by the inputs, the captured tensors and the numbers of rows."""
+        if any(tensor._version != version for tensor, version in ran.versions):
+            raise RuntimeError(
+                f"a tensor that {self.program.name} reads was modified by an inplace operation before the "
+                "backward pass, which needs it as it was."
+            )
+        if torch.is_grad_enabled():
+            say(self.program.name, "a derivative of a derivative is wanted")
+            return self._by_definition(ran, tensors, needs, ends, again=True)
+        adjoint = Backward(ran, [tensor.detach() for tensor in tensors], needs, ends)
+        if adjoint.built is not None:
+            return adjoint.run(kept)
+        self._refused = True
+        with torch.enable_grad():
+            return self._by_definition(ran, tensors, needs, ends, again=False)
+
+    def _by_definition(
+        self,
+        ran: Ran,
+        tensors: Sequence[Tensor],
+        needs: Sequence[bool],
+        ends: Sequence[Tensor | None],
+        *,
+        again: bool,
+    ) -> list[Tensor | None]:
+        """The gradients of the definition, which is computed once more."""
+        count = sum(self.sizes)
+        inputs = [x.view_as(x) if need else x for x, need in zip(tensors, needs, strict=True)]
+        rest = iter(inputs[count:])
+        others: dict[int, Tensor] = {id(tensor): next(rest) for tensor in ran.captured}
+        others |= {id(numbers): RowNumbers(next(rest)) for numbers in ran.numbers}
+        given = self.given(inputs[:count])
+        row, now, carry = given.trees()
+        with Substituted(others):
+            found = self.program.definition(carry, now, row, steps=self.times, every=self.every)
+        pairs = zip(flatten(found)[0], ends, strict=True)
+        some = [(x, end) for x, end in pairs if end is not None and x.requires_grad]
+        wanted = [x for x, need in zip(inputs, needs, strict=True) if need]
+        if not some:
+            return [None] * len(inputs)
+        values, slopes = zip(*some, strict=True)
+        gradients = iter(torch.autograd.grad(values, wanted, slopes, create_graph=again, allow_unused=True))
+        return [next(gradients) if need else None for need in needs]
+
+
+class _Gradient(torch.autograd.Function):
+    """The results of a program, and their gradients."""
+
+    @staticmethod
+    def forward(ctx: Any, ran: Ran, *tensors: Tensor) -> tuple[Tensor, ...]:
+        ctx.ran = ran
+        ctx.set_materialize_grads(False)
+        rooms, kept = ran.call.forward(ran, [tensor.detach() for tensor in tensors])
+        ctx.save_for_backward(*tensors, *kept)
+        ctx.mark_non_differentiable(*[room for room in rooms if not room.is_floating_point()])
+        return tuple(rooms)
+
+    @staticmethod
+    def backward(ctx: Any, *ends: Tensor | None) -> tuple[Tensor | None, ...]:
+        saved, needs = ctx.saved_tensors, ctx.needs_input_grad[1:]
+        if all(end is None for end in ends):
+            return (None,) * (1 + len(needs))
+        count = len(needs)
+        return None, *ctx.ran.call.backward(ctx.ran, saved[:count], saved[count:], needs, ends)
+
+
+def carried(compiled: Compiled) -> int:
+    """Return the bytes of the carry of a row."""
+    return sum(shape.numel() for shape, _ in compiled.carry) * compiled.real.itemsize
+
+
+def flipped(leaf: Any) -> Any:
+    """Return what times bring, (B, T, ...) or `Shared` (T, ...), from the last time to the first."""
+    return Shared(leaf.tensor.flip(0)) if isinstance(leaf, Shared) else leaf.flip(1)

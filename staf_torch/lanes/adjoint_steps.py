@@ -1,0 +1,132 @@
+"""The steps behind a gradient: one that keeps the carries, and the adjoint, from the last time to the first.
+
+The adjoint is a step of a row like any other, written with `torch.func.vjp`, so that a program of it runs
+where the first one runs. A tensor that the step found elsewhere becomes an input of it: wherever torch meets
+it, another stands in its place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+
+from .row_numbers import RowNumbers
+from .trace.step import Step
+from .trace.tracer import NotLoweredError
+from .tree import Tree, flatten, unflatten
+
+
+class Wanted(NamedTuple):
+    """What has a gradient, and what one comes from: a flag for every leaf."""
+
+    now: tuple[bool, ...]
+    shared: tuple[bool, ...]  # which inputs of a time are alike for all rows
+    row: tuple[bool, ...]
+    captured: tuple[int, ...]  # places among the tensors that the step reads
+    numbers: tuple[int, ...]  # places among the numbers of rows
+    outputs: tuple[bool, ...]
+
+
+def keeping_step(step: Step) -> Step:
+    """Return the step that also puts out the carry as it was before."""
+
+    def keeping(carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
+        after, out = step(carry, now, row)
+        return after, (out, flatten(carry)[0])
+
+    return keeping
+
+
+def adjoint_step(
+    step: Step,
+    structures: dict[str, Any],
+    wanted: Wanted,
+    captured: Sequence[Tensor],
+    numbers: Sequence[RowNumbers],
+) -> Step:
+    """Return the step from the gradients by the next carry to those by the carry.
+
+    Its carry is (gradients by the carry's real leaves, sums over times of those by what a row has once and by
+    captured tensors), its inputs of a time (the carry's leaves before, the inputs' leaves, the gradients by
+    the outputs that have one), its inputs of a row (their leaves, captured tensors, numbers of rows).
+
+    Args:
+        step: of a program.
+        structures: of the program's inputs.
+        wanted: for which there are gradients.
+        captured, numbers: those of ``wanted``.
+    """
+
+    def adjoint(carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
+        (slopes, sums), (before, brought, ends), (once, found, columns) = carry, now, row
+        moving = [leaf.is_floating_point() for leaf in before]
+        groups = [*zip(before, moving, strict=True), *zip(brought, wanted.now, strict=True)]
+        groups += [*zip(once, wanted.row, strict=True)]
+        given = [leaf for leaf, one in groups if one] + [*found, *columns]
+
+        def forward(*inputs: Tensor) -> tuple[Tensor, ...]:
+            rest = iter(inputs)
+            leaves = iter([next(rest) if one else leaf for leaf, one in groups])
+            trees = [unflatten(structures[kind], leaves) for kind in ("carry", "now", "row")]
+            others: dict[int, Tensor] = {id(tensor): next(rest) for tensor in captured}
+            others |= {id(each): next(rest)[0] for each in numbers}
+            with Substituted(others) as substituted:
+                after, out = step(*trees)
+            if substituted.unmet:
+                raise NotLoweredError("a tensor that requires a gradient is read where nobody sees it")
+            following = [leaf for leaf in flatten(after)[0] if leaf.is_floating_point()]
+            made = zip(flatten(out)[0], wanted.outputs, strict=True)
+            return *following, *(leaf for leaf, one in made if one)
+
+        _, pull = torch.func.vjp(forward, *given)[:2]
+        found_slopes = iter(pull((*slopes, *ends)))
+        earlier = [next(found_slopes) for one in moving if one]
+        at_times = [
+            next(found_slopes).unsqueeze(0) if shared else next(found_slopes)
+            for one, shared in zip(wanted.now, wanted.shared, strict=True)
+            if one
+        ]
+        total = [before + slope.to(before.dtype) for before, slope in zip(sums, found_slopes, strict=True)]
+        return (earlier, total), at_times
+
+    return adjoint
+
+
+class Substituted(TorchFunctionMode):
+    """Context: in place of some tensors, wherever a function of torch meets them, it is given others.
+
+    Args:
+        others: by the identities of those that they replace.
+
+    Attributes:
+        unmet: identities of those that no function met.
+    """
+
+    def __init__(self, others: dict[int, Tensor]) -> None:
+        super().__init__()
+        self._others, self.unmet = others, set(others)
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        if getattr(func, "__name__", "") in _OF_IDENTITY:
+            return func(*args, **kwargs or {})
+        return func(*map(self._swapped, args), **{k: self._swapped(v) for k, v in (kwargs or {}).items()})
+
+    def _swapped(self, value: Any) -> Any:
+        if isinstance(value, Tensor):
+            other = self._others.get(id(value))
+            if other is None:
+                return value
+            self.unmet.discard(id(value))
+            return other
+        if isinstance(value, list | tuple) and not hasattr(value, "_fields"):
+            return type(value)(map(self._swapped, value))
+        return value
+
+
+_OF_IDENTITY = frozenset(("__hash__", "__repr__", "__format__"))

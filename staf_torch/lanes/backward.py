@@ -1,0 +1,285 @@
+"""The backward pass of a program: blocks of rows, each from the last time to the first.
+
+The adjoint needs the carry before every step. If the forward pass has not kept it, it is computed again, of
+as many rows as the caches hold; and where even their carries go beyond the budget, those of some times first
+and then those between them. Sums over rows are taken of 64 rows each by halves, and of these sums by halves:
+the order depends on the number of rows alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from .adjoint_steps import Wanted, adjoint_step
+from .call import Given
+from .trace.step import Step
+from .tree import Shared, flatten, plain
+
+if TYPE_CHECKING:
+    from .adjoint import Ran
+    from .program import Program
+
+_UNIT = 64  # rows that are summed first, whatever the threads
+_CACHED = 2**20  # bytes of carries, a thread, that are computed again at once
+
+
+class Backward:
+    """The backward pass of one call.
+
+    Args:
+        ran: the call.
+        tensors: inputs, captured tensors, columns of rows' numbers.
+        needs: which of them have a gradient.
+        ends: gradients by the carry and the outputs, None where there are none.
+
+    Attributes:
+        built: of the adjoint; None where there is none.
+    """
+
+    def __init__(
+        self, ran: Ran, tensors: Sequence[Tensor], needs: Sequence[bool], ends: Sequence[Tensor | None]
+    ) -> None:
+        call, compiled = ran.call, ran.built.compiled
+        self._ran, self._call = ran, call
+        sizes = (*call.sizes, len(ran.captured), len(ran.numbers))
+        given = call.given(tensors[: sum(call.sizes)])
+        self._row, self._now, self._carry = given.row, given.now, given.carry
+        *_, self._captured, self._own = split(tensors, sizes)
+        self._of_row, self._of_now, self._of_carry, of_captured, of_own = split(needs, sizes)
+        self._of_captured = [k for k, need in enumerate(of_captured) if need]
+        self._of_own = [k for k, need in enumerate(of_own) if need]
+        self._moves = [dtype.is_floating_point for _, dtype in compiled.carry]
+        self._end, self._ends = [*ends[: call.sizes[2]]], [*ends[call.sizes[2] :]]
+        self._wanted = Wanted(
+            now=tuple(self._of_now),
+            shared=tuple(isinstance(leaf, Shared) for leaf in self._now),
+            row=tuple(self._of_row),
+            captured=tuple(ran.order[id(ran.captured[k])] for k in self._of_captured),
+            numbers=tuple(self._of_own),
+            outputs=tuple(end is not None for end in self._ends),
+        )
+        # What sums over times are by, and whether all rows share it.
+        summed = [
+            (plain(x), isinstance(x, Shared)) for x, w in zip(self._row, self._of_row, strict=True) if w
+        ]
+        summed += [(self._captured[k], True) for k in self._of_captured]
+        self._summed = [*summed, *((self._own[k], False) for k in self._of_own)]
+        few = slice(0, min(call.rows, _UNIT))
+        begin = [leaf[few] for leaf in self._carry]
+        given = self._given(few, slice(0, 1), self._slopes(few), [leaf.unsqueeze(1) for leaf in begin], None)
+        self._on_processor = given.ordinary() is True
+        program = call.program.follower(("adjoint", self._wanted), self._step, follows=ran.built.followed)
+        self.built = program.built(given)
+        used = [] if self.built is None else self.built.compiled.rows
+        places = {id(numbers): k for k, numbers in enumerate(ran.numbers)}
+        self._read = [self._own[places[id(numbers)]] for numbers in used]
+
+    def _step(self, program: Program) -> Step:
+        """Return the adjoint of a program's step: of the call's, or of that which it follows."""
+        trace = self._ran.built.trace
+        found = [program.in_place_of(trace.recipe.found[self._ran.found[k]]) for k in self._of_captured]
+        numbers = [program.in_place_of(trace.rows[k]) for k in self._of_own]
+        return adjoint_step(program.step, self._call.structures, self._wanted, found, numbers)
+
+    def run(self, kept: Sequence[Tensor]) -> list[Tensor | None]:
+        """Return the gradients by all tensors.
+
+        Args:
+            kept: the carry before every time, if the forward pass has kept it.
+        """
+        call, (rows, times) = self._call, self._blocks(bool(kept))
+        slopes, sums = list[list[Tensor]](), list[list[Tensor]]()
+        at_times = _AtTimes([x for x, need in zip(self._now, self._of_now, strict=True) if need], call.times)
+        for start in range(0, call.rows, rows):
+            block = slice(start, min(start + rows, call.rows))
+            after, total = self._block(block, times, kept, at_times)
+            slopes.append(after)
+            pairs = zip(total, self._summed, strict=True)
+            sums.append([_units(x) if shared else x for x, (_, shared) in pairs])
+        return self._sorted(
+            [_joined(parts) for parts in zip(*slopes, strict=True)],
+            [_joined(parts) for parts in zip(*sums, strict=True)],
+            at_times.joined(),
+        )
+
+    def _sorted(
+        self, slopes: Sequence[Tensor], sums: Sequence[Tensor], at_times: Sequence[Tensor]
+    ) -> list[Tensor | None]:
+        """Gradients in the order of the tensors."""
+        pairs = zip(sums, self._summed, strict=True)
+        totals = iter([_halved(x, 0).to(of.dtype) if shared else x.to(of.dtype) for x, (of, shared) in pairs])
+        times, carries = iter(at_times), iter(slopes)
+        row = [next(totals) if need else None for need in self._of_row]
+        now = [next(times) if need else None for need in self._of_now]
+        each = [next(carries) if moves else None for moves in self._moves]
+        carry = [x if need else None for x, need in zip(each, self._of_carry, strict=True)]
+        captured = [next(totals) if k in self._of_captured else None for k in range(len(self._captured))]
+        return [*row, *now, *carry, *captured, *self._numbers(totals)]
+
+    def _numbers(self, totals: Any) -> list[Tensor | None]:
+        return [next(totals) if k in self._of_own else None for k in range(len(self._own))]
+
+    def _blocks(self, kept: bool) -> tuple[int, int]:
+        """Return how many rows, and how many times of theirs, are taken at once."""
+        call, threads = self._call, torch.get_num_threads()
+        unit, compiled = _UNIT * threads, self._ran.built.compiled
+        size = max(1, sum(shape.numel() for shape, _ in compiled.carry) * compiled.real.itemsize)
+        sums = sum((x.numel() if shared else x[0].numel()) for x, shared in self._summed) * 8
+        most = self._ran.budget // (4 * sums + 1)  # rows of which the sums fit
+        if kept:
+            return max(unit, most // unit * unit), call.times
+        room = _CACHED * threads if self._on_processor else self._ran.budget
+        rows = max(unit, min(room // (size * call.times), most) // unit * unit)
+        held = min(rows, call.rows) * size
+        if held * call.times <= self._ran.budget:
+            return rows, call.times
+        return rows, min(call.times, max(math.isqrt(call.times) + 1, self._ran.budget // (2 * held)))
+
+    def _block(
+        self, rows: slice, times: int, kept: Sequence[Tensor], at_times: _AtTimes
+    ) -> tuple[list[Tensor], list[Tensor]]:
+        """Run some rows from the last time to the first: gradients by their carry, and sums over times."""
+        call = self._call
+        starts = range(0, call.times, times)
+        begins = [[leaf[rows] for leaf in self._carry]]
+        if len(starts) > 1:
+            found = self._carries(rows, slice(0, call.times), begins[0], times)
+            begins = [[leaf[:, k] for leaf in found] for k in range(len(starts))]
+        slopes, sums = self._slopes(rows), None
+        for start, begin in zip(reversed(starts), reversed(begins), strict=True):
+            piece = slice(start, min(start + times, call.times))
+            before = [x[rows] for x in kept] if kept else self._carries(rows, piece, begin, 1)
+            given = self._given(rows, piece, slopes, before, sums)
+            assert self.built is not None
+            found = call.run(self.built, given, [column[rows] for column in self._read], 1, back=True)
+            slopes, sums, slow = split(found, (len(slopes), len(self._summed), len(at_times.leaves)))
+            at_times.put(rows, piece, slow)
+        return slopes, sums or []
+
+    def _slopes(self, rows: slice) -> list[Tensor]:
+        """Gradients by the carry after the last time."""
+        triples = zip(self._carry, self._end, self._moves, strict=True)
+        return [torch.zeros_like(x[rows]) if end is None else end[rows] for x, end, moves in triples if moves]
+
+    def _carries(self, rows: slice, times: slice, begin: Sequence[Tensor], every: int) -> list[Tensor]:
+        """The carry before times of some rows, computed again."""
+        row, now = self._some(self._row, rows, None), self._some(self._now, rows, times)
+        count, length = rows.stop - rows.start, times.stop - times.start
+        given = Given([*begin], now, row, self._call.structures, count, length)
+        own = [column[rows] for column in self._own]
+        return self._call.run(self._ran.built, given, own, every, back=False)[-len(begin) :]
+
+    def _some(self, leaves: Sequence[Any], rows: slice, times: slice | None) -> list[Any]:
+        if times is None:
+            return [leaf if isinstance(leaf, Shared) else leaf[rows] for leaf in leaves]
+        return [Shared(x.tensor[times]) if isinstance(x, Shared) else x[rows, times] for x in leaves]
+
+    def _given(
+        self,
+        rows: slice,
+        times: slice,
+        slopes: Sequence[Tensor],
+        before: Sequence[Tensor],
+        sums: Sequence[Tensor] | None,
+    ) -> Given:
+        """Return the inputs of the adjoint."""
+        count, real = rows.stop - rows.start, self._ran.built.compiled.real
+        if sums is None:
+            shapes = [x.shape if shared else x.shape[1:] for x, shared in self._summed]
+            sums = [torch.zeros((count, *shape), dtype=real, device=self._device) for shape in shapes]
+        ends = [self._at(end, rows, times) for end in self._ends if end is not None]
+        captured = [Shared(self._captured[k]) for k in self._of_captured]
+        own = [self._own[k][rows] for k in self._of_own]
+        trees = {
+            "carry": ([*slopes], [*sums]),
+            "now": ([*before], self._some(self._now, rows, times), ends),
+            "row": (self._some(self._row, rows, None), captured, own),
+        }
+        flat = {name: flatten(tree) for name, tree in trees.items()}
+        structures = {name: structure for name, (_, structure) in flat.items()}
+        leaves = {name: found for name, (found, _) in flat.items()}
+        return Given(**leaves, structures=structures, rows=count, times=times.stop - times.start)
+
+    @property
+    def _device(self) -> torch.device:
+        return plain(next(iter((*self._carry, *self._row, *self._now)))).device
+
+    def _at(self, end: Tensor, rows: slice, times: slice) -> Tensor:
+        """Gradients by an output at all times, some of which were recorded."""
+        every = self._call.every
+        if every == 1:
+            return end[rows, times]
+        first, last = -(-times.start // every), -(-times.stop // every)
+        spread = end.new_zeros((rows.stop - rows.start, times.stop - times.start, *end.shape[2:]))
+        spread[:, first * every - times.start :: every] = end[rows, first:last]
+        return spread
+
+
+class _AtTimes:
+    """Gradients by what times bring, put together of blocks of rows and times.
+
+    Args:
+        leaves: what they are by.
+        times: all of them.
+    """
+
+    def __init__(self, leaves: Sequence[Any], times: int) -> None:
+        self.leaves, self._times = leaves, times
+        self._found: list[list[Tensor]] = [[] for _ in leaves]
+
+    def put(self, rows: slice, times: slice, slopes: Sequence[Tensor]) -> None:
+        """Add those of a block, (rows, times, ...)."""
+        count, whole = rows.stop - rows.start, times.stop - times.start == self._times
+        for leaf, slope, found in zip(self.leaves, slopes, self._found, strict=True):
+            if isinstance(leaf, Shared):
+                slope = _units(slope)
+            elif not whole or count < len(leaf):
+                if not found:
+                    found.append(torch.empty_like(leaf))
+                found[0][rows, times] = slope
+                continue
+            if whole:
+                found.append(slope)
+                continue
+            if times.stop == self._times:
+                found.append(slope.new_empty((len(slope), self._times, *slope.shape[2:])))
+            found[-1][:, times] = slope
+
+    def joined(self) -> list[Tensor]:
+        """Return those of all rows and times."""
+        pairs = zip(self.leaves, self._found, strict=True)
+        return [
+            _halved(_joined(f), 0).to(x.tensor.dtype) if isinstance(x, Shared) else f[0] for x, f in pairs
+        ]
+
+
+def _units(x: Tensor) -> Tensor:
+    """Sums over 64 rows each."""
+    missing = -len(x) % _UNIT
+    if missing:
+        x = torch.cat((x, x.new_zeros((missing, *x.shape[1:]))))
+    return _halved(x.unflatten(0, (-1, _UNIT)), 1)
+
+
+def _halved(x: Tensor, dim: int) -> Tensor:
+    """The sum over a dimension by halves: the same bits on any number of threads."""
+    while (count := x.shape[dim]) > 1:
+        half = count // 2
+        both = x.narrow(dim, 0, half) + x.narrow(dim, half, half)
+        x = torch.cat((both, x.narrow(dim, 2 * half, 1)), dim) if count % 2 else both
+    return x.squeeze(dim)
+
+
+def _joined(parts: Sequence[Tensor]) -> Tensor:
+    return parts[0] if len(parts) == 1 else torch.cat([*parts])
+
+
+def split(leaves: Sequence[Any], sizes: Sequence[int]) -> list[list[Any]]:
+    """Return consecutive parts of these sizes."""
+    rest = iter(leaves)
+    return [[next(rest) for _ in range(size)] for size in sizes]
