@@ -315,6 +315,7 @@ class Program(Derived):
         """Return the program that also puts out the carry before every step, and what was built of it."""
         if not given.ordinary() or not self._alone(given):
             return None
+        self.reads()
         program = self.follower("keeping", lambda of: keeping_step(of.step), follows=True)
         built = program.built(given)
         return None if built is None else (program, built)
