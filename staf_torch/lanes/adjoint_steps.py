@@ -20,7 +20,7 @@ from .trace.tracer import NotLoweredError
 from .tree import Tree, flatten, unflatten
 
 
-class Wanted(NamedTuple):
+class Differentiated(NamedTuple):
     """What has a gradient, and what one comes from: a flag for every leaf."""
 
     now: tuple[bool, ...]
@@ -44,7 +44,7 @@ def keeping_step(step: Step) -> Step:
 def adjoint_step(
     step: Step,
     structures: dict[str, Any],
-    wanted: Wanted,
+    wanted: Differentiated,
     captured: Sequence[Tensor],
     numbers: Sequence[RowNumbers],
 ) -> Step:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from .adjoint_steps import Wanted, adjoint_step
+from .adjoint_steps import Differentiated, adjoint_step
 from .call import Given
 from .trace.step import Step
 from .tree import Shared, flatten, plain
@@ -55,7 +55,7 @@ class Backward:
         self._of_own = [k for k, need in enumerate(of_own) if need]
         self._moves = [dtype.is_floating_point for _, dtype in compiled.carry]
         self._end, self._ends = [*ends[: call.sizes[2]]], [*ends[call.sizes[2] :]]
-        self._wanted = Wanted(
+        self._form = Differentiated(
             now=tuple(self._of_now),
             shared=tuple(isinstance(leaf, Shared) for leaf in self._now),
             row=tuple(self._of_row),
@@ -73,7 +73,7 @@ class Backward:
         begin = [leaf[few] for leaf in self._carry]
         given = self._given(few, slice(0, 1), self._slopes(few), [leaf.unsqueeze(1) for leaf in begin], None)
         self._on_processor = given.ordinary() is True
-        program = call.program.follower(("adjoint", self._wanted), self._step, follows=ran.built.followed)
+        program = call.program.follower(("adjoint", self._form), self._step, follows=ran.built.followed)
         self.built = program.built(given)
         used = [] if self.built is None else self.built.compiled.rows
         places = {id(numbers): k for k, numbers in enumerate(ran.numbers)}
@@ -84,7 +84,7 @@ class Backward:
         trace = self._ran.built.trace
         found = [program.in_place_of(trace.recipe.found[self._ran.found[k]]) for k in self._of_captured]
         numbers = [program.in_place_of(trace.rows[k]) for k in self._of_own]
-        return adjoint_step(program.step, self._call.structures, self._wanted, found, numbers)
+        return adjoint_step(program.step, self._call.structures, self._form, found, numbers)
 
     def run(self, kept: Sequence[Tensor]) -> list[Tensor | None]:
         """Return the gradients by all tensors.
