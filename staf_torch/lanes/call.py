@@ -10,7 +10,7 @@ import mmap
 import operator
 import os
 import struct
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -127,6 +127,20 @@ def seen_by_others() -> bool:
 _TENSORS = (Tensor, torch.nn.Parameter)
 
 
+def at_once(x: Tensor) -> bool:
+    """Return `ordinary` of one tensor where the processor's lanes run it, and not on `device.host`."""
+    return (
+        type(x) is Tensor
+        and x.is_cpu
+        and not (x.requires_grad and torch.is_grad_enabled())
+        and not x.is_neg()
+        and torch._C._functorch.peek_interpreter_stack() is None
+        and forward_ad._current_level < 0
+        and not torch._C._len_torch_dispatch_stack()
+        and processor is True
+    )
+
+
 def form(leaf: Any) -> Form:
     """Return what a plan must know about an input."""
     tensor = plain(leaf)
@@ -149,6 +163,7 @@ class PlannedCall:
     Attributes:
         structure: of the outputs.
         direct: whether a call reads nothing of its inputs but their addresses.
+        simple: whether it is direct, short, and its results are small and as they are written.
     """
 
     def __init__(
@@ -195,6 +210,8 @@ class PlannedCall:
         for k, (shape, _) in enumerate(self._rooms):
             if torch.Size(shape).numel() * self._like.element_size() >= LARGE:
                 self._large.append(k)
+        self.simple = self.direct and not (compiled.rows or self._large or self._dtypes)
+        self.simple = self.simple and self._rows_and_times < _MANY
         self._packed = struct.Struct(f"{len(slots)}q").pack
         self._slots = (_Slot * max(len(slots), 1))(*slots)
         self._call = _CallRecord(rows, steps, every, compiled.table.data_ptr(), ctypes.addressof(self._slots))
@@ -232,6 +249,13 @@ class PlannedCall:
             leaves: inputs of the forms that the examples had.
         """
         given, real = leaves, self._compiled.real
+        if self.simple:
+            rooms = [
+                torch.empty_strided(shape, strides, dtype=real, device=_CPU) for shape, strides in self._rooms
+            ]
+            addresses = self._packed(*map(_address, given), *map(_address, rooms))
+            self._compiled.call(self._reference, addresses, torch.get_num_threads())
+            return rooms
         if self._compiled.rows:
             given = self._with_columns(leaves)
         if not self.direct:
@@ -239,7 +263,7 @@ class PlannedCall:
             for k in self._copied:
                 given[k] = given[k].to(real).contiguous()
         empty = torch.empty_strided
-        rooms = [empty(shape, strides, dtype=real, device="cpu") for shape, strides in self._rooms]
+        rooms = [empty(shape, strides, dtype=real, device=_CPU) for shape, strides in self._rooms]
         for k in self._large:
             shape, strides = self._rooms[k]
             rooms[k] = fresh(self._like, torch.Size(shape).numel()).as_strided(shape, strides)
@@ -260,8 +284,30 @@ class PlannedCall:
     def _with_columns(self, leaves: Sequence[Any]) -> list[Any]:
         return [*leaves[: self._once], *columns(self._compiled.rows, self._rows), *leaves[self._once :]]
 
+    def of_states(self, *lead: int) -> Callable[..., Tensor] | None:
+        """Return the function of the inputs to the only output of one time, (*lead, ...); None if that is
+        more than a call of machine code.
 
-_address = Tensor.data_ptr
+        Args:
+            lead: the rows of the output, or nothing for a single row without that dimension.
+        """
+        if not self.simple or len(self._rooms) != 1:
+            return None
+        (size, _), real = self._compiled.outputs[0], self._compiled.real
+        strides = inner_strides(size, self._rows)
+        shape, strides = (*lead, *size), (*(1 for _ in lead), *strides)
+        packed, call, reference, threads = self._packed, self._compiled.call, self._reference, _threads
+
+        def found(*given: Tensor) -> Tensor:
+            room = torch.empty_strided(shape, strides, dtype=real, device=_CPU)
+            call(reference, packed(*map(_address, given), room.data_ptr()), threads())
+            return room
+
+        found.plan = self  # type: ignore[attr-defined]  # keeps what the reference leads to
+        return found
+
+
+_address, _threads, _CPU = Tensor.data_ptr, torch.get_num_threads, torch.device("cpu")
 
 
 def inner_strides(shape: Sequence[int], unit: int) -> tuple[int, ...]:

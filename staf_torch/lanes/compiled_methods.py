@@ -23,7 +23,7 @@ from torch.utils import _device
 
 from ..signs import Sign
 from . import call
-from .call import ordinary
+from .call import PlannedCall, at_once, ordinary
 from .contents import BOUND, Contents
 from .locks import Mutex
 from .loops import tracing_now
@@ -85,7 +85,13 @@ def worth(pays: bool) -> bool:
 
 
 class Served(Protocol):
-    """The callable in the place of a method: (n,) or (B, n) to (B, 1, m), or trees of (B, ...) to such."""
+    """The callable in the place of a method: (n,) or (B, n) to (B, 1, m), or trees of (B, ...) to such.
+
+    Attributes:
+        at_once: by shape, strides and dtype of x what finds y, (n,) to (m,) or (B, n) to (B, m).
+    """
+
+    at_once: dict[Any, Callable[[Tensor], Tensor]]
 
     @property
     def compiled(self) -> bool: ...
@@ -166,6 +172,7 @@ class CompiledMethod:
         self._asked, self.waits = 0.0, False  # whether it was to be compiled, and has not been called since
         self._plain: tuple[PlainTime, float] | None = None  # of its first call, with so many rows
         self._lock = Mutex()
+        self._at_once: dict[Any, Callable[[Tensor], Tensor]] = {}  # by shape, strides, dtype: of what serves
         self._served: Served | None = None  # written before what it has read
         self._read: Contents | None = None
 
@@ -176,6 +183,16 @@ class CompiledMethod:
     @opaque
     def __call__(self, x: Tensor, /, *more: Tree) -> Any:
         """y: (..., n) -> (..., m), or trees of (B, ...)."""
+        read = self._read
+        if read is not None and not more and at_once(x) and _when != "never" and not tracing_now():
+            found = self._at_once.get((x.shape, x.stride(), x.dtype))
+            if found is not None and read.unchanged(library=False) and not read.wants_gradient():
+                self.waits = False
+                return found(x)
+        return self._looked_at(x, *more)
+
+    def _looked_at(self, x: Tensor, *more: Tree) -> Any:
+        """Compute where a call is not like an earlier one that machine code has served."""
         try:
             plain = not ordinary(flatten((x, *more))[0] if more else (x,)) or x.numel() == 0 or tracing_now()
         except RuntimeError:  # a nested tensor has no size
@@ -301,6 +318,7 @@ class CompiledMethod:
                     made = self.definition, settings.name, self.definition, self.owner
                     rows = Rows(*made, copies=settings.copies)
                     served = _Trees(rows) if trees else rows
+            self._at_once = {} if served is None else served.at_once
             self._served, self._read = served, read
             return read
 
@@ -377,6 +395,7 @@ class Rows:
         else:
             self.program = Program(step, name=name, copies=copies)
         self._plans: dict[Any, Plan] = {}
+        self.at_once: dict[Any, Callable[[Tensor], Tensor]] = {}
 
     @property
     def compiled(self) -> bool:
@@ -396,7 +415,9 @@ class Rows:
         if plan is not None:
             if len(self._plans) >= _KEPT:
                 self._plans.clear()
+                self.at_once.clear()
             self._plans[key] = plan
+            keep_at_once(self.at_once, plan, *given)
         return found
 
     def planned(self, *given: Tensor) -> tuple[Plan | None, Tensor]:
@@ -406,11 +427,19 @@ class Rows:
         return prepared.plan, found
 
 
+def keep_at_once(known: dict[Any, Callable[[Tensor], Tensor]], plan: Plan, x: Tensor, *more: Tensor) -> None:
+    """Note what finds y for states like x alone, (n,) or (B, n), where that is a call of machine code."""
+    found = plan.of_states(*x.shape[:-1]) if isinstance(plan, PlannedCall) and not more else None
+    if found is not None:
+        known[x.shape, x.stride(), x.dtype] = found
+
+
 class _Trees:
     """The variant of `Rows` that maps trees (B, ...) to trees (B, ...)."""
 
     def __init__(self, rows: Rows) -> None:
         self._program, self.compiled = rows.program, False
+        self.at_once: dict[Any, Callable[[Tensor], Tensor]] = {}
 
     def __call__(self, *given: Tree) -> Tree:
         self.compiled = self.compiled or self._program.compiles((), (), given, steps=1)

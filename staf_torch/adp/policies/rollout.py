@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -13,6 +14,7 @@ from ...approximation.basis import StaFBasis
 from ...centers import Radius, StateFollowingCenters, ball, cross_polytope, rings
 from ...kernels import ExponentialKernel, GaussianKernel, Kernel
 from ...lanes import call, compiled, each, repeat
+from ...lanes.call import PlannedCall
 from ...lanes.compiled_methods import Rows, check_states
 from ...lanes.prepared import Plan
 from ...lanes.row_objects import refuse_rows
@@ -249,6 +251,7 @@ class _TwoPrograms:
         )
 
         self._one: dict[Any, tuple[Tensor, Plan, Plan]] = {}  # calls with one state
+        self.at_once: dict[Any, Callable[[Tensor], Tensor]] = {}  # those that are two calls of machine code
 
     @property
     def compiled(self) -> bool:
@@ -259,8 +262,6 @@ class _TwoPrograms:
         one = self._one.get(key)
         if one is not None:  # the plans read where the numbers are, and not in which shape
             u, roll, improve = one
-            if roll.direct and improve.direct:
-                return improve((x, roll((x, u))[0]))[0]
             at = x.reshape(1, -1)  # of another dtype than the program's: what is copied needs its shape
             return improve((at, roll((at.expand(len(u), -1), u))[0].view(1, len(u))))[0]
         check_states((x,))
@@ -276,7 +277,12 @@ class _TwoPrograms:
         if first is not None and second is not None:
             if len(self._one) >= _KEPT:
                 self._one.clear()
+                self.at_once.clear()
             self._one[key] = u, first, second
+            if isinstance(first, PlannedCall) and isinstance(second, PlannedCall):
+                roll, improve = first.of_states(count), second.of_states(*x.shape[:-1])
+                if roll is not None and improve is not None:
+                    self.at_once[key[:3]] = lambda x: improve(x, roll(x, u))
         return found
 
 
