@@ -291,6 +291,6 @@ class _ChaseRun:
         self.carry = after.chase._replace(time=start + states.shape[1], diverged_at=diverged_at)
         self._unit = after.unit
         if not self._warned:
-            self._warned = self._problem.basis.warn_reach(float(after.reach.max()), stacklevel=6)
+            self._warned = self._problem.basis.warn_reach(float(after.reach.detach().max()), stacklevel=6)
         found: row_program.Outputs = outputs
         return found

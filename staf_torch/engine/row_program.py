@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from ..approximation.basis import GramStructure, Target
 from ..lanes import Program
-from ..lanes.call import ordinary
+from ..lanes.call import served
 from ..lanes.compiled_methods import worth
 from ..lanes.shared_programs import SharedPrograms, number
 from ..optim.base import UpdateLaw
@@ -140,7 +140,7 @@ def program(problem: Problem, states: Tensor, carry: RowCarry, *, everything: bo
         carry: what it starts from.
         everything: whether all results are wanted, or the weights alone.
     """
-    if not worth(states.shape[1] >= _SHORTEST) or not ordinary((states, carry.chase.weights)):
+    if not worth(states.shape[1] >= _SHORTEST) or not served((states, carry.chase.weights)):
         return None
     settings = problem.inner_steps, problem.certificate, everything
     owners = problem.basis, problem.target, problem.law, problem.predictor, *settings

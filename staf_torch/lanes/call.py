@@ -102,6 +102,12 @@ def ordinary(leaves: Sequence[Any]) -> Where:
     return processor
 
 
+def served(leaves: Sequence[Any]) -> Where:
+    """Return where plain tensors are, as `ordinary`, also where a derivative is wanted."""
+    with torch.no_grad():
+        return ordinary(leaves)
+
+
 def _one_device(leaves: Sequence[Any]) -> Where:
     """Return the CUDA device where plain tensors are, single numbers aside; False where there is none."""
     found, recorded = set[torch.device](), torch.is_grad_enabled()

@@ -13,7 +13,7 @@ from ..signs import Sign
 from . import cache
 from .adjoint_steps import keeping_step
 from .cache import Trace
-from .call import Compiled, Given, form, ordinary
+from .call import Compiled, Given, form, ordinary, served
 from .compiler import machine_code
 from .contents import Contents, Derived
 from .emit.c import Names, c_text
@@ -217,9 +217,15 @@ class Program(Derived):
         self._look_around()
         leaves, structure = flatten((row, now, carry))
         prepared = self._prepared.get((structure, tuple(map(form, leaves)), steps, 1))
-        if prepared is not None and prepared.plan is not None:  # it has served such ones
-            return bool(ordinary(leaves))
-        return self.find(Given.of(carry, now, row, steps)) is not None
+        plan = None if prepared is None else prepared.plan
+        if plan is not None and ordinary(leaves) and not self.differentiated():  # it has served such ones
+            return True
+        if not served(leaves):
+            return False
+        self.reads()
+        wanted, given = self.differentiated() or not ordinary(leaves), Given.of(carry, now, row, steps)
+        with torch.no_grad():
+            return (self.keeping(given) if wanted else self.find(given)) is not None
 
     def text(self, carry: Tree, now: Tree = (), row: Tree = (), *, steps: int | None = None) -> str:
         """The C++ of the program for such inputs.

@@ -69,12 +69,10 @@ class SharedPrograms:
         program, read, _ = self._latest.get(_identities(owners), (None, None, None))
         if read is None or read.reason is not None or not read.unchanged():
             return None
-        if read.wants_gradient():
-            return None
         return program
 
     def of(self, step: Step, *parts: Any, copies: int = 0, owners: tuple[Any, ...] = ()) -> Program:
-        """Return the program of a step: plain torch where a derivative by one of its tensors may be wanted.
+        """Return the program of a step.
 
         Args:
             step: of a program.
@@ -93,8 +91,6 @@ class SharedPrograms:
             new.described(None, ())
             return new
         tensors = read.tensors
-        if read.wants_gradient():
-            return Program(step, name=self._name, compile=False)
         versions = [*map(version, tensors)]
         with self._lock:
             return self._found(step, read, versions, copies, owners)
