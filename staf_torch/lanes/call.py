@@ -165,6 +165,7 @@ class PlannedCall:
         rows, steps, every: of the call.
         once: how many of the leaves a row has once.
         backwards: whether times are read and written from the last to the first.
+        rooms: examples of tensors, rows innermost, that results are written into; none where they are new.
 
     Attributes:
         structure: of the outputs.
@@ -183,6 +184,7 @@ class PlannedCall:
         every: int,
         once: int = 0,
         backwards: bool = False,
+        rooms: Sequence[Tensor] = (),
     ) -> None:
         self._compiled, self.structure, self._rows_and_times = compiled, compiled.structure, rows * steps
         self._rows, self._once = rows, once
@@ -205,7 +207,15 @@ class PlannedCall:
             )
             for s, _ in compiled.outputs
         ]
-        slots += [_Slot(1, time, rows, entries) for _, _, entries, time in (*ends, *histories)]
+        if rooms:
+            strides = [room.stride() for room in rooms]
+            timed = [*[False] * len(ends), *[True] * len(histories)]
+            slots += [
+                _Slot(1, s[1] if at_times else 0, s[-1] if len(s) > 1 + at_times else 1, end[2])
+                for s, at_times, end in zip(strides, timed, (*ends, *histories), strict=True)
+            ]
+        else:
+            slots += [_Slot(1, time, rows, entries) for _, _, entries, time in (*ends, *histories)]
         real = compiled.real
         self._late = self._reverse(slots, steps, recorded) if backwards else None
         self._rooms = [(shape, strides) for shape, strides, _, _ in (*ends, *histories)]
@@ -216,7 +226,7 @@ class PlannedCall:
         for k, (shape, _) in enumerate(self._rooms):
             if torch.Size(shape).numel() * self._like.element_size() >= LARGE:
                 self._large.append(k)
-        self.simple = self.direct and not (compiled.rows or self._large or self._dtypes)
+        self.simple = self.direct and not (compiled.rows or self._large or self._dtypes or backwards or rooms)
         self.simple = self.simple and self._rows_and_times < _MANY
         self._packed = struct.Struct(f"{len(slots)}q").pack
         self._slots = (_Slot * max(len(slots), 1))(*slots)
@@ -226,11 +236,8 @@ class PlannedCall:
 
     def _reverse(self, slots: list[_Slot], steps: int, recorded: int) -> list[int]:
         """Turn the times of all slots around; return the bytes from an address to that of the last time."""
-        inputs, size = (
-            len(slots) - len(self._compiled.carry) - len(self._compiled.outputs),
-            self._compiled.real.itemsize,
-        )
-        late = []
+        inputs = len(slots) - len(self._compiled.carry) - len(self._compiled.outputs)
+        late, size = [], self._compiled.real.itemsize
         for k, slot in enumerate(slots):
             late.append(((steps if k < inputs else recorded) - 1) * slot.time * size)
             slot.time = -slot.time
@@ -262,17 +269,30 @@ class PlannedCall:
             addresses = self._packed(*map(_address, given), *map(_address, rooms))
             self._compiled.call(self._reference, addresses, torch.get_num_threads())
             return rooms
-        if self._compiled.rows:
-            given = self._with_columns(leaves)
-        if not self.direct:
-            given = [leaf.tensor if type(leaf) is Shared else leaf for leaf in given]
-            for k in self._copied:
-                given[k] = given[k].to(real).contiguous()
         empty = torch.empty_strided
         rooms = [empty(shape, strides, dtype=real, device=_CPU) for shape, strides in self._rooms]
         for k in self._large:
             shape, strides = self._rooms[k]
             rooms[k] = fresh(self._like, torch.Size(shape).numel()).as_strided(shape, strides)
+        self.into(rooms, leaves)
+        for k, dtype in self._dtypes:
+            rooms[k] = rooms[k].to(dtype)
+        return rooms
+
+    def into(self, rooms: Sequence[Tensor], leaves: Sequence[Any]) -> None:
+        """Write the carry after the last step and the outputs into tensors of the program's dtype.
+
+        Args:
+            rooms: as the examples, or as a call makes them.
+            leaves: inputs of the forms that the examples had.
+        """
+        given: Sequence[Any] = leaves
+        if self._compiled.rows:
+            given = self._with_columns(leaves)
+        if not self.direct:
+            given = [leaf.tensor if type(leaf) is Shared else leaf for leaf in given]
+            for k in self._copied:
+                given[k] = given[k].to(self._compiled.real).contiguous()
         if self._late is None:
             addresses = self._packed(*map(_address, given), *map(_address, rooms))
         else:
@@ -283,9 +303,6 @@ class PlannedCall:
         else:
             with Sign("compiled code"):
                 self._compiled.call(self._reference, addresses, torch.get_num_threads())
-        for k, dtype in self._dtypes:
-            rooms[k] = rooms[k].to(dtype)
-        return rooms
 
     def _with_columns(self, leaves: Sequence[Any]) -> list[Any]:
         return [*leaves[: self._once], *columns(self._compiled.rows, self._rows), *leaves[self._once :]]
