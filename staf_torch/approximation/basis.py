@@ -14,7 +14,7 @@ from ..kernels import Kernel
 from ..lanes.row_numbers import over_rows
 from ..lanes.row_objects import Rowwise
 from ..local_basis import Degrees, LocalBasis, LocalSpace
-from ..numerics.checks import sampled, trailing, values_of
+from ..numerics.checks import learns, sampled, trailing, values_of
 from .coefficient_format import compare, decode, encode, record
 
 Target = Callable[[Tensor], Tensor]
@@ -209,7 +209,7 @@ class StaFBasis(nn.Module, metaclass=Rowwise):
         Raises:
             ValueError: by `numerics.checks.kept`, where kernel, radius or centers read one.
         """
-        if any(True for _ in self.parameters()):
+        if learns(self):
             zero = self.centers.directions.new_zeros(1, self.dim)
             self(zero.unsqueeze(-2) + 1, zero)
 

@@ -171,9 +171,9 @@ def _plain(target: Target) -> Target:
 
 
 def _with(problem: Problem, law: UpdateLaw, target: Target) -> Problem:
-    return Problem(
-        problem.call, problem.basis, target, law, problem.inner_steps, problem.predictor, problem.certificate
-    )
+    other = copy.copy(problem)  # which was checked
+    vars(other).update(law=law, target=target)
+    return other
 
 
 def _symmetric(gram: Tensor) -> Tensor:

@@ -45,6 +45,7 @@ _FIXED = (
     *(tuple, type, frozenset, complex, slice, range, np.generic, np.dtype, torch.dtype, torch.device),
     *(FunctionType, BuiltinFunctionType, MethodType),
 )
+_CODE = (type, FunctionType, BuiltinFunctionType)
 _SIMPLE = (int, float, complex, str, bytes, tuple, list, dict, set, frozenset, Tensor)
 _OF_EVERY_MODULE = frozenset(vars(nn.Module()))  # looked into by themselves
 _READ = ("training", "_parameters", "_buffers", "_modules", "_forward_hooks", "_forward_pre_hooks")
@@ -225,8 +226,13 @@ class Contents:
         return chain(chain.from_iterable(self._views), own, read, cells, chain.from_iterable(codes))
 
 
+@functools.lru_cache(maxsize=4096)
 def _is_layer(kind: type) -> bool:
-    """Return whether a class makes parameters by itself, which require gradients by default."""
+    """Return whether a class or one of its bases makes parameters, which require gradients by default."""
+    return any(map(_makes_parameters, kind.__mro__))
+
+
+def _makes_parameters(kind: type) -> bool:
     root, _, rest = kind.__module__.partition(".")
     return kind is not nn.Module and (
         root == "torch" or (root == _PACKAGE and rest.startswith("approximation"))
@@ -361,7 +367,7 @@ class Walk(pickle.Pickler):
 
     def reducer_override(self, value: Any) -> Any:
         if isinstance(value, nn.Module):
-            if any(map(_is_layer, type(value).__mro__)):
+            if _is_layer(type(value)):
                 self.layers.update(map(id, value._parameters.values()))
             state = {k: v for k, v in value.__getstate__().items() if k not in _IDLE and k != BOUND}
             # The keys of hooks count all hooks of the process.
@@ -380,11 +386,15 @@ class Walk(pickle.Pickler):
         return NotImplemented
 
     def persistent_id(self, value: Any) -> Any:
-        if type(value) in _ATOMS:  # most of all: asked for every object
+        kind = type(value)
+        if kind in _ATOMS:  # most of all: asked for every object
+            return None
+        if kind is dict:
+            self._note_dict(value)
             return None
         if isinstance(value, Tensor):
             return self._tensor(value)
-        if isinstance(value, type | FunctionType | BuiltinFunctionType):
+        if isinstance(value, _CODE):
             return self._code(value)
         if isinstance(value, ModuleType):
             if not installed(value.__name__):
@@ -398,7 +408,7 @@ class Walk(pickle.Pickler):
                 self.unwatched = f"an array of {value.nbytes} bytes"
             # By their digest: keys stay small.
             return str(value.dtype), value.shape, hashlib.blake2b(value.tobytes()).digest()
-        if type(value).__module__ == "itertools":  # Python 3.12 warns of it, 3.14 refuses
+        if kind.__module__ == "itertools":  # Python 3.12 warns of it, 3.14 refuses
             raise pickle.PicklingError(f"an iterator, {type(value).__name__}")
         self._note(value)
         return None

@@ -314,6 +314,13 @@ def kept(module: nn.Module, name: str, *, zero: bool = False, squared: bool = Fa
     return value
 
 
+def learns(module: nn.Module) -> bool:
+    """Return whether a module holds parameters, a tenth of the time of a look into ``parameters()``."""
+    return any(part is not None for part in module._parameters.values()) or any(
+        learns(part) for part in module._modules.values() if part is not None
+    )
+
+
 def values_of(tensor: Tensor) -> Tensor | None:
     """Return the numbers of a tensor, also inside a transform of `torch.func`; None in a tracer."""
     if tensor.is_meta or torch.compiler.is_compiling() or torch._C._len_torch_dispatch_stack():
