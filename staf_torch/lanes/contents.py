@@ -39,7 +39,7 @@ _OF_PYTHON = frozenset(sys.stdlib_module_names) - {"__main__"}
 _FOLDERS = tuple(Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib", "purelib", "platlib"))
 _PACKAGES = frozenset(("site-packages", "dist-packages"))
 _VERSIONED = frozenset((_PACKAGE, "torch", "numpy", *_OF_PYTHON))  # other processes have the same
-_ATOMS = frozenset((str, int, float, bool, bytes, tuple, type(None)))  # and what an address alone tells apart
+ATOMS = frozenset((str, int, float, bool, bytes, tuple, type(None)))  # and what an address alone tells apart
 _SMALL = 1 << 14  # bytes of an array that are compared at every call
 _FIXED = (
     *(tuple, type, frozenset, complex, slice, range, np.generic, np.dtype, torch.dtype, torch.device),
@@ -49,7 +49,7 @@ _CODE = (type, FunctionType, BuiltinFunctionType)
 _SIMPLE = (int, float, complex, str, bytes, tuple, list, dict, set, frozenset, Tensor)
 _OF_EVERY_MODULE = frozenset(vars(nn.Module()))  # looked into by themselves
 _READ = ("training", "_parameters", "_buffers", "_modules", "_forward_hooks", "_forward_pre_hooks")
-_IDLE = _OF_EVERY_MODULE - {*_READ}  # hooks of derivatives and of state_dicts, and what goes with other hooks
+IDLE = _OF_EVERY_MODULE - {*_READ}  # hooks of derivatives and of state_dicts, and what goes with other hooks
 _log = logging.getLogger(__name__)
 _said: set[tuple[str, str]] = set()  # what has been logged
 _MISSING = object()
@@ -369,7 +369,7 @@ class Walk(pickle.Pickler):
         if isinstance(value, nn.Module):
             if _is_layer(type(value)):
                 self.layers.update(map(id, value._parameters.values()))
-            state = {k: v for k, v in value.__getstate__().items() if k not in _IDLE and k != BOUND}
+            state = {k: v for k, v in value.__getstate__().items() if k not in IDLE and k != BOUND}
             # The keys of hooks count all hooks of the process.
             hooks = {k: tuple(v.values()) for k, v in state.items() if k.endswith("_hooks") and v}
             self.dicts += [state[k] for k in hooks]
@@ -387,7 +387,7 @@ class Walk(pickle.Pickler):
 
     def persistent_id(self, value: Any) -> Any:
         kind = type(value)
-        if kind in _ATOMS:  # most of all: asked for every object
+        if kind in ATOMS:  # most of all: asked for every object
             return None
         if kind is dict:
             self._note_dict(value)

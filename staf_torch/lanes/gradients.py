@@ -14,12 +14,13 @@ import functools
 import inspect
 import io
 from collections.abc import Callable, Sequence
+from types import FunctionType, MethodType
 from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
 
-from .contents import Walk
+from .contents import ATOMS, BOUND, IDLE, Derived, Walk, is_users
 from .tree import flatten, unflatten
 
 _P = ParamSpec("_P")
@@ -116,6 +117,8 @@ def _wanting(value: Any, depth: int = 6) -> tuple[list[Tensor], list[Tensor]]:
     """Return the tensors of an object that require a gradient: of somebody, and parameters of layers."""
     if value is None or isinstance(value, Tensor):
         return ([value] if value is not None and value.requires_grad else []), []
+    if _surely_none(value, {}):
+        return [], []
     walk = Walk(io.BytesIO())
     try:
         walk.dump(value)
@@ -126,6 +129,43 @@ def _wanting(value: Any, depth: int = 6) -> tuple[list[Tensor], list[Tensor]]:
     found = [part for part in walk.tensors if part.requires_grad]
     layers = [part for part in found if id(part) in walk.layers]
     return [part for part in found if id(part) not in walk.layers], layers
+
+
+def _surely_none(value: Any, seen: dict[int, Any]) -> bool:
+    """Return whether modules and containers of this library's and torch's, down to numbers and tensors, hold
+    no tensor that requires a gradient: a tenth of the time of a walk. False where there is more to look at.
+
+    Args:
+        value: to look into.
+        seen: what has been looked into, by its address.
+    """
+    kind = type(value)
+    if kind in _NUMBERS:
+        return True
+    if isinstance(value, Tensor):
+        return not value.requires_grad
+    if id(value) in seen:
+        return True
+    seen[id(value)] = value
+    if isinstance(value, dict | tuple | list):
+        parts = value.values() if isinstance(value, dict) else value
+    elif isinstance(value, MethodType):
+        parts = value.__self__, value.__func__
+    elif isinstance(value, FunctionType):
+        cells = value.__closure__ or ()
+        if is_users(value) or vars(value):
+            return False
+        parts = (value.__defaults__, *(cell.cell_contents for cell in cells))
+    elif isinstance(value, type):
+        return not is_users(value)
+    elif hasattr(value, "__dict__") and not isinstance(value, Derived) and not is_users(kind):
+        parts = [part for name, part in vars(value).items() if name not in IDLE and name != BOUND]
+    else:
+        return False
+    return all(_surely_none(part, seen) for part in parts)
+
+
+_NUMBERS = frozenset((*ATOMS - {tuple}, torch.dtype, torch.device, torch.Size))
 
 
 def _inside(value: Any) -> list[Any]:
