@@ -356,9 +356,7 @@ class OnnxWriter:
         one, power = self._constant([[1]], dtype), self._emit("Exp", [x])
         less = self._emit("Sub", [power, one])
         exact = self._emit("Div", [self._emit("Mul", [less, x]), self._emit("Log", [power])])
-        ends = self._emit(
-            "Or", [self._emit("IsInf", [self._emit("Log", [power])]), self._emit("IsInf", [power])]
-        )
+        ends = self._emit("Or", [self._emit("IsInf", [each]) for each in (self._emit("Log", [power]), power)])
         return self._where(self._emit("Equal", [power, one]), x, self._where(ends, less, exact))
 
     def _log1p(self, x: str, dtype: Any) -> str:
@@ -428,10 +426,8 @@ class OnnxWriter:
             for name, k in zip(put, kept, strict=True)
         ]
         body = make.make_graph(statements, f"loop{self.part}_{number}", begins, ends)
-        results, stacked = (
-            [f"_r{self.part}_{number}_{k}" for k in live],
-            [f"_y{self.part}_{number}_{k}" for k in kept],
-        )
+        results = [f"_r{self.part}_{number}_{k}" for k in live]
+        stacked = [f"_y{self.part}_{number}_{k}" for k in kept]
         given = [self._constant(loop.count, np.int64), self._constant(True, bool), *initial]
         self.scopes[-1][0].append(make.make_node("Loop", given, [*results, *stacked], body=body))
         self.results |= {("result", number, k): name for k, name in zip(live, results, strict=True)}

@@ -7,14 +7,16 @@ rank below the size, in its own row.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from ..lanes.one_thread import alone
-from .checks import fail
+from .checks import fail, positive_real, real, vector
+
+Matrix = float | Sequence[float] | Sequence[Sequence[float]] | Tensor
 
 
 def condition_number(gram: Tensor) -> Tensor:
@@ -37,6 +39,24 @@ def _symmetric(call: str, name: str, matrix: Tensor, size: int) -> None:
         raise fail(call, name, "must be finite", matrix)
     if not torch.allclose(matrix, matrix.mT, rtol=1e-12, atol=0.0):
         raise fail(call, name, "must be symmetric", matrix)
+
+
+def square(call: str, name: str, value: Matrix, size: int) -> Tensor:
+    """A matrix given as itself, by its diagonal, or as a number times the identity: (size, size)."""
+    if isinstance(value, Tensor):
+        given = value.to(torch.float64)
+        if given.dim() > 1:
+            return given
+        identity = torch.eye(size, dtype=torch.float64, device=given.device)
+        return given.diag() if given.dim() else given * identity
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        if value and all(isinstance(entry, int | float) for entry in value):
+            given = torch.tensor(vector(call, name, value, len(value)), dtype=torch.float64, device="cpu")
+            return given.diag()
+        rows = [vector(call, name, row, len(value)) for row in value]
+        return torch.tensor(rows, dtype=torch.float64, device="cpu")
+    number = real if name == "terminal" else positive_real  # nothing may be paid at the end
+    return number(call, name, value) * torch.eye(size, dtype=torch.float64, device="cpu")
 
 
 def positive_definite(call: str, name: str, matrix: Tensor, size: int) -> Tensor:

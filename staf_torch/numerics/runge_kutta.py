@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Callable, Sequence
 
+import torch
 from torch import Tensor
 
 SHARES = (0.0, 0.5, 0.5, 1.0)
@@ -61,3 +63,19 @@ def runge_kutta_mean(values: Sequence[Tensor], dt: float | Tensor) -> Tensor:
     """The integral over a step of what has these values at its four stages (Simpson's rule)."""
     first, second, third, last = values
     return (dt / 6) * (first + 2 * (second + third) + last)
+
+
+def stage_weights(length: float | Tensor, discount: float, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return where the stages stand, and weights of slopes and costs, s: (4, ..., 1) twice, (4, ...)."""
+    if not isinstance(length, Tensor):
+        h, left = length, math.exp(-0.5 * discount * length)  # what the middle still counts; the end, squared
+        between = (h / 2, h / 3, left * h / 3)
+        table = ((0.0, h / 6, h / 6), between, between, (h, h / 6, left**2 * h / 6))
+        asked, counted, worth = torch.tensor(table, dtype=like.dtype, device=like.device).unbind(-1)
+        return asked.unsqueeze(-1), counted.unsqueeze(-1), worth
+    half = torch.exp(-0.5 * discount * length)
+    ends, middle = length / 6, length / 3
+    asked = torch.stack((torch.zeros_like(length), 0.5 * length, 0.5 * length, length))
+    counted = torch.stack((ends, middle, middle, ends))
+    worth = torch.stack((ends, middle * half, middle * half, ends * half.square()))
+    return asked.unsqueeze(-1), counted.unsqueeze(-1), worth

@@ -11,10 +11,11 @@ import torch
 from torch import Tensor
 
 from ...numerics.checks import choice, fail, integer, positive_real
+from ...numerics.linalg import Matrix
 from ...numerics.row_checks import check_rows
 from ...signs import Sign
 from ...systems import Plant
-from ..problem.cost import Matrix, QuadraticCost
+from ..problem.cost import QuadraticCost
 from ..problem.sampled import SampledProblem
 from ..problem.shapes import state_of
 from .ddp import BoxDDP

@@ -19,13 +19,12 @@ from ...numerics.checks import (
     numbers_of,
     one_or_each,
     positive,
-    positive_real,
     real,
     trailing,
     vector,
 )
 from ...numerics.default_device import beside
-from ...numerics.linalg import positive_definite, positive_semidefinite
+from ...numerics.linalg import Matrix, positive_definite, positive_semidefinite, square
 from ...numerics.row_checks import check_rows
 from ...numerics.shown import limits, shown, sizes
 from ...systems import Bounds, Plant
@@ -34,7 +33,6 @@ from ...systems.equilibria import resting_input_at
 
 _EDGE = 1 - 1e-9  # of the bound, beyond which artanh is that of this share
 
-Matrix = float | Sequence[float] | Sequence[Sequence[float]] | Tensor
 EndValue = Callable[[Tensor], Tensor]
 """V_T from x: (..., n) -> (...)."""
 Output = Callable[[Tensor], Tensor]
@@ -99,8 +97,7 @@ class Cost(nn.Module, metaclass=OfRows):
         name = type(self).__name__
         self.dim, self.inputs, self.output = dim, inputs, output
         self.target = _point(name, "target", target, dim)
-        zeros = torch.zeros(dim, dtype=torch.float64, device="cpu")
-        tried = zeros if self.target is None else self.target
+        tried = torch.zeros(dim, dtype=torch.float64, device="cpu") if self.target is None else self.target
         seen = dim if output is None else _outputs(name, output, tried, inputs)
         q = positive_semidefinite(name, "state", square(name, "state", state, seen), seen)
         self.register_buffer("q", q)
@@ -119,9 +116,8 @@ class Cost(nn.Module, metaclass=OfRows):
         if self.end_value is not None:
             check_rows(f"{name}(terminal=...)", self.end_value, [tried], sizes=(inputs,))
         end = None if terminal is None or callable(terminal) else square(name, "terminal", terminal, dim)
-        self.register_buffer(
-            "end", None if end is None else positive_semidefinite(name, "terminal", end, dim)
-        )
+        end = None if end is None else positive_semidefinite(name, "terminal", end, dim)
+        self.register_buffer("end", end)
         self.end: Tensor | None  # S
         self.periodic: tuple[int, ...] = ()
         self._periods: tuple[float, ...] = ()  # of the outputs
@@ -178,11 +174,7 @@ class Cost(nn.Module, metaclass=OfRows):
         return other
 
     def extra_repr(self) -> str:
-        given: dict[str, Any] = {
-            "target": self.target,
-            "target_input": self.target_input,
-            "output": self.output,
-        }
+        given: dict[str, Any] = {"target": self.target, "target_input": self.target_input}
         given |= {"output": self.output, "discount": self.discount or None, "terminal": self.ending}
         parts = [f"{name}={shown(value)}" for name, value in given.items() if value is not None]
         rates = f"state={shown(self.q)}, control={shown(self.r)}"
@@ -380,14 +372,12 @@ class BoundedInputCost(Cost):
             raise fail("BoundedInputCost", "control", "must be diagonal", control)
 
     def _prepare(self) -> None:
-        rest = torch.zeros(self.inputs, dtype=torch.float64, device="cpu")
-        rest = rest if self.target_input is None else self.target_input
         if self.bounds is None:
             raise fail("BoundedInputCost", "bound", "must be given, or low and high", None)
+        rest = torch.zeros_like(self.bounds.low) if self.target_input is None else self.target_input
         box = self.bounds.measured_from(rest)
-        if not bool(
-            (box.low < 0).all() and (box.high > 0).all() and torch.isfinite(box.high - box.low).all()
-        ):
+        around = (box.low < 0) & (box.high > 0) & torch.isfinite(box.high - box.low)
+        if not bool(around.all()):
             rule = f"must be finite, with the input {rest.tolist()} of the set-point inside"
             raise fail("BoundedInputCost", "low", rule, self.bounds)
         self.register_buffer("_down", -box.low, persistent=False)
@@ -440,27 +430,6 @@ def matvec(matrix: Tensor, x: Tensor) -> Tensor:
 def _pull(effectiveness: Tensor, gradient: Tensor) -> Tensor:
     """g'p: (..., m)."""
     return (effectiveness * gradient.unsqueeze(-1)).sum(-2)
-
-
-def square(call: str, name: str, value: Matrix, size: int) -> Tensor:
-    """A matrix given as itself, by its diagonal, or as a number times the identity: (size, size)."""
-    if isinstance(value, Tensor):
-        given = value.to(torch.float64)
-        if given.dim() > 1:
-            return given
-        return (
-            given.diag() if given.dim() else given * torch.eye(size, dtype=torch.float64, device=given.device)
-        )
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        if value and all(isinstance(entry, int | float) for entry in value):
-            return torch.tensor(
-                vector(call, name, value, len(value)), dtype=torch.float64, device="cpu"
-            ).diag()
-        return torch.tensor(
-            [vector(call, name, row, len(value)) for row in value], dtype=torch.float64, device="cpu"
-        )
-    number = real if name == "terminal" else positive_real  # nothing may be paid at the end
-    return number(call, name, value) * torch.eye(size, dtype=torch.float64, device="cpu")
 
 
 def _point(call: str, name: str, value: Sequence[float] | Tensor | None, size: int) -> Tensor | None:

@@ -26,6 +26,7 @@ from ...numerics.exponential_step import (
     fewest_steps,
     times,
 )
+from ...numerics.runge_kutta import stage_weights
 from ...systems import Clocked, Plant, StepPlant
 from .cost import Cost
 from .held_linear import periods
@@ -248,7 +249,7 @@ class Holding:
         moved, rests, rates = exponential_stages(table, field, x)
         paid = none
         if cost is not None:
-            shares = _shares(h, self.discount, x)[2]
+            shares = stage_weights(h, self.discount, x)[2]
             whole = h if not self.discount else -math.expm1(-self.discount * h) / self.discount
             paid = whole * cost.input_rate(u)
             if not still:  # what the rate differs from the quadratic form around the start, by Simpson's rule
@@ -438,22 +439,6 @@ def runge_kutta_loop(
         return (slope, moved + count * slope, paid + value * rate), slope if watch else ()
 
     start = torch.zeros_like(x), torch.zeros_like(x), torch.zeros_like(x[..., 0])
-    (_, moved, paid), slopes = scan(stage, start, _shares(length, discount, x), dim=0)
+    (_, moved, paid), slopes = scan(stage, start, stage_weights(length, discount, x), dim=0)
     after = plant.displaced(x, moved)
     return (after, paid, length * (slopes[2] - slopes[1]).abs().amax(-1)) if watch else (after, paid)
-
-
-def _shares(length: float | Tensor, discount: float, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return where the stages stand, and weights of slopes and costs, s: (4, ..., 1) twice, (4, ...)."""
-    if not isinstance(length, Tensor):
-        h, left = length, math.exp(-0.5 * discount * length)  # what the middle still counts; the end, squared
-        between = (h / 2, h / 3, left * h / 3)
-        table = ((0.0, h / 6, h / 6), between, between, (h, h / 6, left**2 * h / 6))
-        asked, counted, worth = torch.tensor(table, dtype=like.dtype, device=like.device).unbind(-1)
-        return asked.unsqueeze(-1), counted.unsqueeze(-1), worth
-    half = torch.exp(-0.5 * discount * length)
-    ends, middle = length / 6, length / 3
-    asked = torch.stack((torch.zeros_like(length), 0.5 * length, 0.5 * length, length))
-    counted = torch.stack((ends, middle, middle, ends))
-    worth = torch.stack((ends, middle * half, middle * half, ends * half.square()))
-    return asked.unsqueeze(-1), counted.unsqueeze(-1), worth

@@ -19,13 +19,13 @@ from ...numerics.angles import turned, unwrapped, wrap
 from ...numerics.checks import fail, integer, trailing
 from ...numerics.default_device import beside
 from ...numerics.forward_mode import use_forward_mode
-from ...numerics.linalg import discrete_riccati, positive_semidefinite, unstabilisable_mode
+from ...numerics.linalg import Matrix, discrete_riccati, positive_semidefinite, square, unstabilisable_mode
 from ...numerics.row_checks import check_rows, is_ours
 from ...numerics.runge_kutta import runge_kutta_mean, runge_kutta_stages
 from ...numerics.shown import limits, sizes
 from ...systems import Bounds, Plant
 from ...systems.bounds import Limit
-from .cost import Cost, EndValue, Matrix, square
+from .cost import Cost, EndValue
 from .held_plant import Holding
 from .rules import check_torch, check_undiscounted, check_within, own_period
 from .shapes import check_problem

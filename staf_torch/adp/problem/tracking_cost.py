@@ -11,10 +11,11 @@ from torch import Tensor
 from ...lanes.row_objects import by_rows
 from ...numerics.angles import wrap
 from ...numerics.checks import copied, fail
+from ...numerics.linalg import Matrix
 from ...numerics.row_checks import check_rows
 from ...systems import Clocked, Plant
 from ...systems.bounds import Limit
-from .cost import Cost, Matrix, QuadraticCost
+from .cost import Cost, QuadraticCost
 
 Path = Callable[[Tensor], Tensor]
 """x_d from t: (...) -> (..., n)."""

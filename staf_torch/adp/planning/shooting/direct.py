@@ -14,12 +14,12 @@ from ....lanes.opaque import opaque
 from ....lanes.row_objects import refuse_rows
 from ....numerics.checks import fail, integer, positive_real, trailing
 from ....numerics.default_device import beside
-from ....numerics.linalg import positive_semidefinite
+from ....numerics.linalg import Matrix, positive_semidefinite, square
 from ....signs import Sign
 from ....systems import ControlAffineSystem, Linear, Plant
 from ....systems.bounds import Limit
 from ...loop.controller import LQR, Policy, Value
-from ...problem.cost import BoundedInputCost, Cost, Matrix, QuadraticCost, quadratic, square
+from ...problem.cost import BoundedInputCost, Cost, QuadraticCost, quadratic
 from ...problem.rules import (
     check_regulates,
     check_still,
