@@ -1,115 +1,429 @@
-"""Run row programs on a CUDA device and compare them with their definitions: ``python -m tests.gpu``.
+"""Run programs of all kinds on a CUDA device: ``python -m tests.gpu``, in less than three minutes.
 
-Not collected by pytest. Prints a line for every program; exits with 1 where one differs, 2 without a device.
+Each is compared with its definition on the processor, with a call of few of its rows, to the bit, and timed:
+the whole call from Python to a synchronised device, and its kernel. Exits with 1 where one is wrong, 2
+without a device. ``--ptxas`` compiles the kernels with nvcc in place of that, and needs no device;
+``--only NAME`` takes some. Not collected by pytest.
 """
 
 from __future__ import annotations
 
+import argparse
+import concurrent.futures
+import functools
+import itertools
+import multiprocessing
+import os
+import statistics
+import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Callable
+import traceback
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 import torch
 from torch import Tensor
 
-from staf_torch import adp, lanes, systems
-from staf_torch.adp.loop.step import ClosedLoop, program
+from staf_torch import lanes
+from tests import gpu_cases as cases
 
-sys.path.insert(0, str(Path(__file__).parent))  # as pytest does it
-from tests.lanes.test_c_and_cuda import flow, given
-from tests.lanes.test_programs import pendulum
+FEW, BUILT = 16, 32
+BOUNDS = {torch.float64: 1e-11, torch.float32: 2e-5}
+ARCHITECTURES = (80, 90, 100)
+Make = Callable[[int, torch.dtype], cases.Case]
+KINDS: dict[
+    str, tuple[Make, tuple[int, ...], float]
+] = {  # rows, and by how much more than BOUNDS it may be off
+    "flow": (cases.flows, (1, 1000, 100_000), 1.0),
+    "pendulum": (cases.pendulums, (1, 1000, 1_000_000), 1.0),
+    "float32 within": (cases.mixed, (1000, 1_000_000), 1e3),  # a sine of float32 is right to two units
+    "inputs turned": (cases.turned, (1000, 1_000_000), 1.0),
+    "memory of 80 states": (cases.memories, (1000, 100_000), 1.0),
+    "stiff loop": (cases.stiff_loops, (1000, 1_000_000), 1.0),
+    "Lorenz, Tsit5": (cases.lorenzes, (1000, 1_000_000, 8_388_608), 10.0),
+    "information actor-critic": (cases.information, (1000, 100_000), 10.0),
+    "SafetyFilter": (cases.filtered, (1000, 100_000), 10.0),
+    "RolloutPolicy": (cases.rollouts, (1000, 100_000), 10.0),
+    "mass of a row's own": (cases.masses, (1000, 1_000_000), 10.0),
+    "chase, everything": (cases.everything, (100_000,), 10.0),
+    "few rows": (cases.weights(3, "SteepestDescent", 400), (1000,), 10.0),
+    "M = 3 SteepestDescent, 100": (cases.weights(3, "SteepestDescent", 100), (100_000, 1_000_000), 10.0),
+}
+SENSITIVE = ("ConjugateGradient", "BarzilaiBorwein", "RecursiveLeastSquares")
+"""Laws that make of a rounding what the condition of the Gram matrix makes of it, again and again."""
+for _count, _loose in ((3, 10.0), (6, 1e3), (15, 1e7)):  # as the condition of the Gram matrix
+    for _law in cases.LAWS:
+        _more = 1e4 if _law in SENSITIVE and _count > 3 else 1.0
+        KINDS[f"M = {_count} {_law}"] = cases.weights(_count, _law, 16), (100_000, 1_000_000), _loose * _more
+
+
+DEVICE = "cuda"
+
+
+def wait() -> None:
+    """Wait for the device."""
+    if DEVICE == "cuda":
+        torch.cuda.synchronize()
+
+
+def on_cpu(call: Callable[[str], Any]) -> Any:
+    with lanes.compiling("never"):
+        return call("cpu")
+
+
+def moved(tree: Any, device: str) -> Any:
+    return lanes.tree.moved(tree, device)
+
+
+def first(tree: Any, rows: int) -> Any:
+    """The first rows of a tree."""
+    leaves, structure = lanes.tree.flatten(tree)
+    some = (leaf if isinstance(leaf, lanes.Shared) else leaf[:rows] for leaf in leaves)
+    return lanes.tree.unflatten(structure, some)
+
+
+def tensors(tree: Any) -> list[Tensor]:
+    leaves: list[Tensor] = lanes.tree.flatten(tree)[0]
+    return leaves
+
+
+def error(found: Any, wanted: Any) -> float:
+    """The largest difference, over 1 + the size of the number; infinite where one is NaN alone."""
+    worst = [0.0]
+    for a, b in zip(tensors(found), tensors(wanted), strict=True):
+        one, two = a.cpu().double(), b.cpu().double()
+        away = torch.where(one == two, 0.0, (one - two).abs() / (1 + two.abs()))
+        away = torch.where(one.isnan() & two.isnan(), 0.0, away).nan_to_num(float("inf"))
+        worst.append(float(away.max()) if a.numel() else 0.0)
+    return max(worst)
+
+
+def on_device(name: str, dtype: torch.dtype, rows: int) -> tuple[cases.Case, Callable[[], Any], Any]:
+    """A case, a call of it on the device, and its first rows by the definition on the CPU."""
+    make = KINDS[name][0]
+    torch.manual_seed(0)
+    case = make(rows, dtype)
+    few = make(min(rows, FEW), dtype)
+    wanted = few.plain(*first(case.inputs, FEW))
+    case.to(DEVICE)
+    given = moved(case.inputs, DEVICE)
+    return case, functools.partial(case.call, *given), wanted
+
+
+def build(name: str, dtype: torch.dtype) -> str:
+    """Leave a kernel in the cache, by a process of its own."""
+    try:
+        with lanes.compiling("always"):
+            on_device(name, dtype, BUILT)[1]()
+        wait()
+    except Exception as told:
+        return f"{name}: {type(told).__name__}: {told}"
+    return ""
+
+
+def timed(call: Callable[[], Any], times: int = 5) -> float:
+    """The median of the seconds of a call, to its end on the device."""
+    seconds = []
+    for _ in range(times):
+        wait()
+        begin = time.perf_counter()
+        call()
+        wait()
+        seconds.append(time.perf_counter() - begin)
+    return statistics.median(seconds)
+
+
+def of_kernels(call: Callable[[], Any]) -> tuple[float, int]:
+    """The seconds that kernels of programs take in a call, NaN unless somebody knows; and how many others."""
+    try:
+        with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as seen:
+            call()
+            wait()
+        found = [(each.key, each.self_device_time_total, each.count) for each in seen.key_averages()]
+    except Exception:
+        return float("nan"), -1
+    own = [micro for key, micro, _ in found if key.startswith("lanes_kernel")]
+    return (sum(own) / 1e6 if own else float("nan")), sum(count for key, _, count in found) - len(own)
+
+
+def compare(name: str, dtype: torch.dtype, rows: int) -> bool:
+    """Print a line of the table; whether it is right."""
+    bound = BOUNDS[dtype] * KINDS[name][2]
+    with lanes.compiling("always"):
+        case, call, wanted = on_device(name, dtype, rows)
+        begin = time.perf_counter()
+        found = call()
+        wait()
+        began = time.perf_counter() - begin
+        away = error(first(found, FEW), wanted)
+        alike, bits = True, "" if rows <= 7 or name == "mass of a row's own" else "same bits"
+        if bits:
+            alone = case.call(*moved(first(case.inputs, 7), DEVICE))
+            pairs = zip(tensors(first(found, 7)), tensors(alone), strict=True)
+            alike = all(torch.equal(a.nan_to_num(7.0), b.nan_to_num(7.0)) for a, b in pairs)
+            bits = bits if alike else "OTHER BITS"
+        del found
+        whole = timed(call)
+        kernel, others = of_kernels(call)
+    steps = rows * case.times
+    right = away <= bound and alike
+    what = f"{name:28} {str(dtype)[6:]:8} {rows:8} {away:8.1e} {began:7.2f}"
+    times = f"{1e3 * whole:9.3f} {1e3 * kernel:9.3f} {steps / whole / 1e9:8.3f} {steps / kernel / 1e9:8.3f}"
+    print(f"{what} {times} {others:4} {bits}{'' if right else '  WRONG'}", flush=True)
+    RATES[name, dtype, rows] = steps / whole
+    return right
+
+
+RATES: dict[tuple[str, torch.dtype, int], float] = {}
+
+
+def in_a_graph() -> bool:
+    """Whether a graph computes what calls do, also with other numbers in its inputs."""
+    case, _, _ = on_device("pendulum", torch.float64, 1000)
+    carry, now, row = moved(case.inputs, DEVICE)
+    case.call(carry, now, row)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        found = case.call(carry, now, row)
+    carry.mul_(0.5)
+    graph.replay()
+    wait()
+    return error(found, case.call(carry, now, row)) == 0.0
+
+
+def on_streams() -> bool:
+    """Whether calls on streams of their own, one after the other, have the numbers of one."""
+    _, call, _ = on_device("M = 3 SteepestDescent, 100", torch.float64, 1000)
+    wanted, found = call(), []
+    for stream in [torch.cuda.Stream() for _ in range(4)]:
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
+            found.append(call())
+    wait()
+    return all(torch.equal(each, wanted) for each in found)
+
+
+def in_threads() -> bool:
+    """Whether several threads, none of which has called CUDA before, get the numbers of one."""
+    _, call, _ = on_device("pendulum", torch.float64, 1000)
+    wanted = call()
+    with concurrent.futures.ThreadPoolExecutor(4) as pool:
+        found = [each.result() for each in [pool.submit(call) for _ in range(8)]]
+    wait()
+    return all(error(each, wanted) == 0.0 for each in found)
+
+
+def nothing_waits() -> bool:
+    """Whether a call comes back while its kernel runs: nothing reads from the device."""
+    _, call, _ = on_device("Lorenz, Tsit5", torch.float64, 1_000_000)
+    call()
+    wait()
+    begin = time.perf_counter()
+    call()
+    back = time.perf_counter() - begin
+    wait()
+    print(f"    back after {1e6 * back:.0f} us, ended after {1e6 * (time.perf_counter() - begin):.0f} us")
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        call()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    return back < 0.2 * (time.perf_counter() - begin)
+
+
+def doors() -> dict[str, Callable[[], Any]]:
+    """Functions of the library on tensors of the device, which give the same there as on the CPU."""
+    from staf_torch import adp, systems
+
+    plant, cost = systems.TwoState(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+
+    def x0(device: str, rows: int = 64) -> Tensor:
+        return torch.linspace(-1, 1, 2 * rows, dtype=torch.float64).reshape(rows, 2).to(device)
+
+    def simulated(device: str) -> Any:
+        return systems.simulate(systems.VanDerPol().to(device), x0(device), dt=0.01, steps=400)
+
+    def closed(device: str) -> Any:
+        lqr = adp.Feedback(adp.LQR(plant, cost))
+        return adp.simulate(lqr, plant, cost, x0(device), dt=0.01, steps=300, compile=True).state
+
+    def policy(device: str) -> Any:
+        asked = adp.RolloutPolicy.of_lqr(plant, cost).to(device)
+        lanes.ready(asked, x0(device)[:1])
+        return asked(x0(device)[:1]), asked(x0(device))
+
+    return {"systems.simulate": simulated, "adp.simulate": closed, "a policy": policy}
+
+
+def same_there(call: Callable[[str], Any]) -> bool:
+    """Whether a function of the library has the same results on the device."""
+    away = error(call(DEVICE), on_cpu(call))
+    print(f"    {away:.1e}")
+    return away < 1e-9
+
+
+def of_peers() -> None:
+    """Print the rate of JAX for the same, where it is installed."""
+    sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
+    import numpy as np
+
+    try:
+        import jax
+        import peer_laws
+    except ImportError as told:
+        print(f"no peers: {told}")
+        return
+    measured = ("SteepestDescent", 3, 100), ("ConjugateGradient", 6, 16), ("SteepestDescent", 15, 16)
+    for law, count, times in measured:
+        programs = peer_laws.jax_programs(law, lanes_offsets(count), 10)
+        for dtype in BOUNDS:
+            for rows in (100_000, 1_000_000):
+                x, rates = cases.circles(rows, times, dtype).numpy(), [0.0]
+                for kind, (program, last) in programs.items():
+                    if not last and rows > 100_000:
+                        continue
+                    given = jax.device_put(np.ascontiguousarray(x.transpose(1, 2, 0)) if last else x)
+                    try:
+                        rates.append(rows * times / jax_seconds(lambda f=program, x=given: f(x)))
+                    except Exception as told:
+                        print(f"JAX {kind}: {str(told)[:200]}")
+                name = f"M = {count} {law}" + (", 100" if times == 100 else "")
+                ours, best = RATES.get((name, dtype, rows), float("nan")), max(rates)
+                told = f"{best / 1e9:8.3f} G/s; ours {ours / best if best else 0:6.1f} times"
+                print(f"JAX {name:28} {str(dtype)[6:]:8} {rows:8} {told}", flush=True)
+
+
+def jax_seconds(call: Callable[[], Any]) -> float:
+    """The median of the seconds of a call of JAX."""
+    call().block_until_ready()
+    seconds = []
+    for _ in range(3):
+        begin = time.perf_counter()
+        call().block_until_ready()
+        seconds.append(time.perf_counter() - begin)
+    return statistics.median(seconds)
+
+
+def lanes_offsets(count: int) -> Any:
+    import staf_torch as st
+
+    return (st.rings(count) * cases.RADIUS[count]).double().numpy()
+
+
+def registers(only: str) -> int:
+    """Compile the kernels with nvcc for several architectures; print their registers and what is spilled."""
+    bad = 0
+    for name, (make, _, _) in KINDS.items():
+        for dtype in (torch.float64, torch.float32):
+            if only not in name:
+                continue
+            torch.manual_seed(0)
+            case = make(3, dtype)
+            with lanes.compiling("always"), lanes.device.recorded() as texts:
+                case.call(*case.inputs)
+            for text in texts:
+                found = ptxas(text)
+                spilled = sum(each[1] for each in found.values())
+                bad |= int(spilled > 0)
+                told = ", ".join(
+                    f"sm_{a} {r} registers {s} spilled {f} stack" for a, (r, s, f) in found.items()
+                )
+                print(f"{name:28} {str(dtype)[6:]:8} {told}", flush=True)
+    return bad
+
+
+def ptxas(text: str, architectures: tuple[int, ...] = ARCHITECTURES) -> dict[int, tuple[int, int, int]]:
+    """Registers, bytes spilled and bytes of stack of a kernel, by nvcc and ptxas."""
+    found = {}
+    with tempfile.TemporaryDirectory() as folder:
+        source, middle = Path(folder) / "kernel.cu", Path(folder) / "kernel.ptx"
+        source.write_text(text)
+        command = ["nvcc", "-ptx", f"-arch=compute_{min(architectures)}", "--fmad=false"]
+        subprocess.run([*command, "-w", "-o", middle, source], check=True)
+        for each in architectures:
+            out = Path(folder) / "kernel.cubin"
+            given = ["ptxas", "-v", f"-arch=sm_{each}", "-o", out, middle]
+            told = subprocess.run(given, check=True, capture_output=True, text=True).stderr
+            numbers = [line.split() for line in told.splitlines()]
+            used = next(int(line[line.index("Used") + 1]) for line in numbers if "Used" in line)
+            frames = [line for line in numbers if "spill" in line]
+            found[each] = (
+                used,
+                sum(int(line[line.index("spill") - 2]) for line in frames),
+                sum(int(line[0]) for line in frames),
+            )
+    return found
 
 
 def main() -> int:
+    global DEVICE
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    options.add_argument("--ptxas", action="store_true")
+    options.add_argument("--host", action="store_true", help="the host as a device, few rows")
+    options.add_argument("--only", default="")
+    options.add_argument("--largest", type=int, default=10**9, help="rows")
+    options.add_argument("--no-peers", action="store_true")
+    given = options.parse_args()
+    if given.ptxas:
+        return registers(given.only)
+    if given.host:
+        DEVICE = "cpu"
+        with lanes.device.host():
+            return int(bool([None for line in table(given.only, min(given.largest, 1000)) if not line]))
     if not torch.cuda.is_available():
         print("no CUDA device here")
         return 2
-    print(torch.cuda.get_device_name())
-    worst = 0
-    for name, case in CASES.items():
-        for dtype, bound in ((torch.float64, 1e-12), (torch.float32, 2e-5)):
-            for rows in (1, 1000, 100_000):
-                most = max(bound, 1e-9) if case is mixed else bound  # a float32 sine is right to two units
-                worst = max(worst, compare(name, *case(rows, dtype), most))
-    return worst
-
-
-Case = tuple[lanes.Program, Any, Any, Any]  # the program and its inputs
-
-
-def flows(rows: int, dtype: torch.dtype) -> Case:
-    return lanes.Program(flow), *given(rows, dtype)
-
-
-def pendulums(rows: int, dtype: torch.dtype) -> Case:
-    carry, now = torch.randn(rows, 2, dtype=dtype), torch.randn(rows, 30, dtype=dtype)
-    row = torch.rand(rows, dtype=dtype), lanes.Shared(torch.tensor(2.0, dtype=dtype))
-    return lanes.Program(pendulum), carry, now, row
-
-
-class Motor(systems.ControlAffineSystem):
-    """A mode of 127 1/s and more, held for 20 ms: exponential steps."""
-
-    dim, inputs = 2, 1
-
-    def drift(self, x: Tensor) -> Tensor:
-        speed = x[..., 1]
-        return torch.stack((speed, -127 * speed * (1 + 0.1 * speed.tanh().square())), dim=-1)
-
-    def effectiveness(self, x: Tensor) -> Tensor:
-        return torch.tensor([[0.0], [27.8]]).to(x).expand(*x.shape[:-1], 2, 1)
-
-
-def loops(rows: int, dtype: torch.dtype) -> Case:
-    plant, weights = Motor(), torch.diag(torch.tensor([1550.0, 15.5], dtype=torch.float64))
-    cost = adp.QuadraticCost(weights, 1 / 144, dim=2, inputs=1)
-    policy = adp.Feedback(adp.LQR(plant, cost, period=0.02))
-    loop = ClosedLoop(policy, plant, cost, dt=0.02, substeps=None)
-    x0 = torch.randn(rows, 2, dtype=dtype)
-    return program(loop.to(dtype), True), loop.init(x0), torch.zeros(rows, 30, 0, 2, dtype=dtype), {}
-
-
-def mixed(rows: int, dtype: torch.dtype) -> Case:
-    """float32 constants and float32 arithmetic inside a program of another dtype."""
-
-    def step(x: Tensor, now: Any, row: Any) -> tuple[Tensor, Tensor]:
-        late = torch.where(x > 0, 1.0, 0.1) * torch.tensor([0.3, 0.7])
-        x = x + 0.01 * (late - x.float().sin())
-        return x.to(dtype), x.to(dtype)
-
-    return lanes.Program(step), torch.randn(rows, 2, dtype=dtype), torch.zeros(rows, 30, dtype=dtype), ()
-
-
-CASES: dict[str, Callable[[int, torch.dtype], Case]] = {
-    "flow": flows,
-    "pendulum": pendulums,
-    "stiff loop": loops,
-    "float32 within": mixed,
-}
-
-
-def compare(name: str, program: lanes.Program, carry: Any, now: Any, row: Any, bound: float) -> int:
-    """Print how far the kernel is from plain torch on the CPU, and its time; 1 where beyond the bound."""
-    wanted, kernel = program.definition(carry, now, row), program
-    inputs = [lanes.tree.moved(tree, "cuda") for tree in (carry, now, row)]
-    found = kernel(*inputs)
-    torch.cuda.synchronize()
     begin = time.perf_counter()
-    kernel(*inputs)
-    torch.cuda.synchronize()
-    seconds = time.perf_counter() - begin
-    pairs = zip(lanes.tree.flatten(found)[0], lanes.tree.flatten(wanted)[0], strict=True)
-    error = max(float(_error(a.cpu().double(), b.double())) for a, b in pairs if a.numel())
-    rows, dtype = len(lanes.tree.flatten(carry)[0][0]), lanes.tree.flatten(carry)[0][0].dtype
-    print(f"{name:15} {dtype!s:14} {rows:7} rows: largest difference {error:.1e}, {1e3 * seconds:.2f} ms")
-    return int(not error <= 10 * bound)  # also where NaN
+    wanted = [(name, dtype) for name in KINDS if given.only in name for dtype in BOUNDS]
+    workers = min(len(wanted), max(1, (os.cpu_count() or 1) - 2))
+    spawn = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(workers, mp_context=spawn) as pool:
+        told = sorted(filter(None, pool.map(build, *zip(*wanted, strict=True))))
+    built = time.perf_counter() - begin
+    print(
+        "\n".join(
+            [*told, f"{torch.cuda.get_device_name()}, torch {torch.__version__}; built in {built:.0f} s"]
+        )
+    )
+    right = [*table(given.only, given.largest), *checked()]
+    if not given.no_peers:
+        of_peers()
+    print(f"{time.perf_counter() - begin:.0f} s in all; {'all right' if all(right) else 'WRONG'}")
+    return int(not all(right))
 
 
-def _error(found: Tensor, wanted: Tensor) -> Tensor:
-    """The largest difference, over 1 + the size of the number."""
-    return ((found - wanted).abs() / (1 + wanted.abs())).max()
+def table(only: str, largest: int) -> Iterator[bool]:
+    """Print the table; whether each line is right."""
+    rates = f"{'G/s':>8} {'kernel':>8} other kernels"
+    print(f"{'program':28} {'dtype':8} {'rows':>8} {'error':>8} first s {'call ms':>9} kernel ms {rates}")
+    for name, dtype in itertools.product((name for name in KINDS if only in name), BOUNDS):
+        for rows in sorted({min(rows, largest) for rows in KINDS[name][1]}):
+            yield attempted(f"{name} {dtype} {rows}", functools.partial(compare, name, dtype, rows))
+            torch.cuda.empty_cache()
+
+
+def checked() -> Iterator[bool]:
+    """Print what else holds; whether each does."""
+    for check in (in_a_graph, on_streams, in_threads, nothing_waits):
+        yield attempted(check.__name__.replace("_", " "), check, told=True)
+    for door, call in doors().items():
+        yield attempted(door, functools.partial(same_there, call), told=True)
+
+
+def attempted(what: str, check: Callable[[], bool], *, told: bool = False) -> bool:
+    """Whether something holds; an error is printed, and what is next goes on."""
+    try:
+        fine = check()
+    except Exception:
+        traceback.print_exc(limit=-5)
+        fine, told = False, True
+    if told:
+        print(f"{what}: {'right' if fine else 'WRONG'}", flush=True)
+    return fine
 
 
 if __name__ == "__main__":

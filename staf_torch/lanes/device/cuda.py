@@ -13,6 +13,7 @@ import hashlib
 import importlib
 import itertools
 import logging
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -175,6 +176,9 @@ class Nvrtc:
     """
 
     def __init__(self, path: str) -> None:
+        if os.path.isabs(path):  # it opens another by its bare name, which must be there by then
+            beside = Path(path).parent.glob("libnvrtc-builtins.so.*")
+            self._builtins = [ctypes.CDLL(str(each)) for each in beside if ".alt." not in each.name]
         self.path, self._library = path, ctypes.CDLL(path)
         word, call = ctypes.c_void_p, self._library
         call.nvrtcCreateProgram.argtypes = (word, ctypes.c_char_p, ctypes.c_char_p, ctypes.c_int, word, word)
@@ -246,6 +250,10 @@ def _libraries() -> Iterator[str]:
         packages.glob("*/lib/libnvrtc.so.*"),
         (Path(torch.__file__).parent / "lib").glob("libnvrtc*.so*"),
     )
-    there = [str(path) for path in itertools.chain(*places) if "builtins" not in path.name]
+    there = [
+        str(path)
+        for path in itertools.chain(*places)
+        if "builtins" not in path.name and ".alt." not in path.name
+    ]
     yield from sorted(there, key=lambda path: not path.endswith(f".so.{version}"))
     yield from (f"libnvrtc.so.{version}", "libnvrtc.so")

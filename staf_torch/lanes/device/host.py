@@ -63,6 +63,32 @@ def host() -> Iterator[None]:
         call.processor = before
 
 
+@contextlib.contextmanager
+def recorded() -> Iterator[list[str]]:
+    """Context: as `host`, and yields the texts of all kernels that calls of the block take.
+
+    Example:
+        >>> program = lanes.Program(lambda x, now, row: (0.5 * x, x))
+        >>> with lanes.device.recorded() as texts:
+        ...     end = program(torch.ones(1), steps=3)
+        >>> len(texts)
+        1
+
+        Shown by `tests/gpu.py`.
+    """
+    global _taken
+    before, texts = _taken, list[str]()
+    try:
+        with host():
+            _taken = texts
+            yield texts
+    finally:
+        _taken = before
+
+
+_taken: list[str] | None = None
+
+
 class HostDevice:
     """A device whose kernels g++ builds."""
 
@@ -73,6 +99,8 @@ class HostDevice:
             OSError: if there is no compiler, or it refuses the text.
         """
         with _lock:
+            if _taken is not None and text not in _taken:
+                _taken.append(text)
             found = _kernels.get(text)
             if found is None:
                 path = library("kernel", _BEFORE + text + _AFTER, _OPTIONS, _FOLDER)

@@ -8,6 +8,7 @@ The same text is C++ for the host, with loops in place of the grid.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
@@ -34,6 +35,8 @@ _OF_C = {
     torch.uint8: "unsigned char",
     torch.bool: "unsigned char",
 }
+_LOOP = re.compile(r"for \(int [pq]\w* = \d+; [pq]\w* < (\d+);")
+_UNROLLED = 16  # passes over an array that a compiler may write out
 _PRELUDE = """#ifndef NAN
 #define NAN __int_as_float(0x7fffffff)
 #endif
@@ -115,6 +118,13 @@ class _CudaWriter(ScalarWriter, TableWriter):
             "};",
             f"#define TABLE(at) {macro}",
         ]
+
+    def _line(self, text: str) -> None:
+        """A line; of a loop over an array of many entries a compiler is not to write out all passes."""
+        loop = _LOOP.match(text)
+        if loop and int(loop[1]) > _UNROLLED:
+            super()._line("#pragma unroll 4")
+        super()._line(text)
 
     def _constant_array(self, name: str, kind: str, values: Iterable[str]) -> None:
         if name in self._arrays:
