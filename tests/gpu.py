@@ -256,7 +256,15 @@ def doors() -> dict[str, Callable[[], Any]]:
         lanes.ready(asked, x0(device)[:1])
         return asked(x0(device)[:1]), asked(x0(device))
 
-    return {"systems.simulate": simulated, "adp.simulate": closed, "a policy": policy}
+    def gradient(device: str) -> Any:
+        program, gain = lanes.Program(cases.pendulum), torch.linspace(0.5, 2, 64).double().to(device)
+        x, gain = x0(device).requires_grad_(), gain.requires_grad_()
+        u, mass = torch.ones(64, 50).double().to(device), lanes.Shared(torch.tensor(2.0).double().to(device))
+        end, angles = program(x, u, (gain, mass))
+        (end.square().sum() + angles.sum()).backward()
+        return x.grad, gain.grad
+
+    return {"systems.simulate": simulated, "adp.simulate": closed, "a policy": policy, "a gradient": gradient}
 
 
 def same_there(call: Callable[[str], Any]) -> bool:
@@ -373,7 +381,7 @@ def main() -> int:
     if given.host:
         DEVICE = "cpu"
         with lanes.device.host():
-            return int(bool([None for line in table(given.only, min(given.largest, 1000)) if not line]))
+            return int(not all([*table(given.only, min(given.largest, 1000)), *checked(())]))
     if not torch.cuda.is_available():
         print("no CUDA device here")
         return 2
@@ -406,9 +414,12 @@ def table(only: str, largest: int) -> Iterator[bool]:
             torch.cuda.empty_cache()
 
 
-def checked() -> Iterator[bool]:
+CHECKS = in_a_graph, on_streams, in_threads, nothing_waits
+
+
+def checked(checks: tuple[Callable[[], bool], ...] = CHECKS) -> Iterator[bool]:
     """Print what else holds; whether each does."""
-    for check in (in_a_graph, on_streams, in_threads, nothing_waits):
+    for check in checks:
         yield attempted(check.__name__.replace("_", " "), check, told=True)
     for door, call in doors().items():
         yield attempted(door, functools.partial(same_there, call), told=True)
