@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from .adjoint_steps import Substituted
-from .backward import Backward, split
-from .call import Compiled, Given, PlannedCall
+from .backward import Backward, empty_rows, rows_at_once, some_rows, split
+from .call import Compiled, Given, PlannedCall, fresh
 from .device.kernel import DeviceCall
 from .log import say
 from .row_numbers import RowNumbers, columns
@@ -72,6 +72,7 @@ class Ran(NamedTuple):
         numbers: of rows that the step reads.
         versions: of what the step reads and has no gradient.
         kept: whether the forward pass keeps the carries.
+        rows: that are taken at once where it does.
         budget: bytes.
     """
 
@@ -83,6 +84,7 @@ class Ran(NamedTuple):
     numbers: tuple[RowNumbers, ...]
     versions: tuple[tuple[Tensor, int], ...]
     kept: bool
+    rows: int
     budget: int
 
 
@@ -129,8 +131,9 @@ class GradientCall:
         found = tuple(k for k, tensor in enumerate(read) if tensor.requires_grad)
         fixed = [t for t in read if not (t.requires_grad or t.is_inference())]
         work = re.search(r"WORK_STEP = (\d+)", built.trace.text.source)
-        size = carried(built.compiled)
+        size, real = carried(built.compiled), built.compiled.real
         pays = work is None or int(work[1]) > _WORTH * size
+        written = sum(shape.numel() for shape, _ in built.compiled.outputs) * real.itemsize * self.times
         return Ran(
             call=self,
             built=built,
@@ -140,6 +143,7 @@ class GradientCall:
             numbers=built.compiled.rows,
             versions=tuple((tensor, tensor._version) for tensor in fixed),
             kept=pays and self.every == 1 and size * self.rows * self.times <= _budget,
+            rows=self.rows if work is None else rows_at_once(written),
             budget=_budget,
         )
 
@@ -149,13 +153,31 @@ class GradientCall:
         row, now, carry = split(leaves, self.sizes)
         return Given(carry, now, row, self.structures, self.rows, self.times)
 
-    def run(self, built: Built, given: Given, own: Sequence[Tensor], every: int, back: bool) -> list[Tensor]:
-        """Run a program on inputs, with the columns of rows' numbers among them; return what it returns."""
+    def run(
+        self,
+        built: Built,
+        given: Given,
+        own: Sequence[Tensor],
+        every: int,
+        *,
+        back: bool = False,
+        rooms: Sequence[Tensor] = (),
+    ) -> list[Tensor]:
+        """Run a program; return what it returns.
+
+        Args:
+            built: the program.
+            given: its inputs.
+            own: columns of rows' numbers.
+            every: times from one recorded output to the next.
+            back: whether from the last time to the first.
+            rooms: tensors of the program's dtype to write to, on the CPU; none where they are new.
+        """
         where = given.ordinary()
         nows = given.now if where is True or not back else [flipped(leaf) for leaf in given.now]
         leaves = [*given.row, *own, *nows, *given.carry]
         forms = tuple([(x.shape, x.stride(), x.dtype) for x in map(plain, leaves)])
-        key = id(built.trace), forms, given.times, every
+        key = id(built.trace), forms, given.times, every, tuple([room.stride() for room in rooms])
         compiled, plan = self._plans.get(key, (None, None))
         if plan is None or compiled is not built.compiled:
             if len(self._plans) >= _PLANS:
@@ -163,23 +185,46 @@ class GradientCall:
             timed = [*[False] * (len(given.row) + len(own)), *[True] * len(nows), *[False] * len(given.carry)]
             alone, sizes = built.compiled._replace(rows=()), {"rows": given.rows, "steps": given.times}
             if isinstance(where, bool):
-                plan = PlannedCall(alone, leaves, timed, **sizes, every=every, backwards=back)
+                plan = PlannedCall(alone, leaves, timed, **sizes, every=every, backwards=back, rooms=rooms)
             else:
                 plan = DeviceCall(alone, leaves, timed, **sizes, every=every, once=0, where=where)
             self._plans[key] = built.compiled, plan
-        rooms, carries = plan(leaves), len(given.carry)
-        return rooms if where is True or not back else [*rooms[:carries], *map(flipped, rooms[carries:])]
+        if rooms and isinstance(plan, PlannedCall):
+            plan.into(rooms, leaves)
+            return [*rooms]
+        found, carries = plan(leaves), len(given.carry)
+        return found if where is True or not back else [*found[:carries], *map(flipped, found[carries:])]
 
     def forward(self, ran: Ran, tensors: Sequence[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
         """Return the carry with the outputs, and the carries that are kept."""
         given = self.given(tensors[: sum(self.sizes)])
         own = tensors[len(tensors) - len(ran.numbers) :]
         fewer = None if ran.kept else self.program.built(given)
-        rooms = self.run(fewer or ran.built, given, own, self.every, back=False)
+        end = len(ran.built.compiled.outputs)  # carries and outputs, before the carries that are kept
+        if ran.kept and given.ordinary() is True:
+            return self._in_blocks(ran, given, own)
+        rooms = self.run(fewer or ran.built, given, own, self.every)
         if fewer is not None:
             return rooms, []
-        end = len(rooms) - self.sizes[2]
-        return rooms[:end], rooms[end:] if ran.kept else []
+        return rooms[:end], [room.movedim(0, -1).unsqueeze(0) for room in rooms[end:]] if ran.kept else []
+
+    def _in_blocks(self, ran: Ran, given: Given, own: Sequence[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
+        """Keep the carries of a block of rows in memory of their own: pages that are far apart cost more."""
+        compiled, rows = ran.built.compiled, min(ran.rows, self.rows)
+        like, end = torch.empty(0, dtype=compiled.real, device="cpu"), len(compiled.outputs)
+        results = [empty_rows(like, self.rows, (), shape) for shape, _ in compiled.carry]
+        made = compiled.outputs[: end - self.sizes[2]]
+        results += [empty_rows(like, self.rows, (self.times,), shape) for shape, _ in made]
+        shapes = [(-(-self.rows // rows), self.times, *shape, rows) for shape, _ in compiled.carry]
+        kept = [fresh(like, *shape) for shape in shapes]
+        for k, start in enumerate(range(0, self.rows, rows)):
+            block = slice(start, min(start + rows, self.rows))
+            rooms = [room[block] for room in results] + [
+                x[k].movedim(-1, 0)[: block.stop - start] for x in kept
+            ]
+            self.run(ran.built, some_rows(given, block), [x[block] for x in own], 1, rooms=rooms)
+        dtypes = [dtype for _, dtype in (*compiled.carry, *made)]
+        return [room.to(dtype) for room, dtype in zip(results, dtypes, strict=True)], kept
 
     def backward(
         self,

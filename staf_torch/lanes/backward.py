@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from .adjoint_steps import Differentiated, adjoint_step
-from .call import Given
+from .call import Given, fresh, inner_strides
 from .trace.step import Step
 from .tree import Shared, flatten, plain
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from .program import Program
 
 _UNIT = 64  # rows that are summed first, whatever the threads
-_CACHED = 2**20  # bytes of carries, a thread, that are computed again at once
+_CACHED = 2**21  # bytes of carries, a thread, that are computed again at once
 
 
 class Backward:
@@ -94,7 +94,12 @@ class Backward:
         """
         call, (rows, times) = self._call, self._blocks(bool(kept))
         slopes, sums = list[list[Tensor]](), list[list[Tensor]]()
-        at_times = _AtTimes([x for x, need in zip(self._now, self._of_now, strict=True) if need], call.times)
+        at_times = _AtTimes(
+            [x for x, need in zip(self._now, self._of_now, strict=True) if need],
+            call.rows,
+            call.times,
+            torch.empty(0, dtype=self._ran.built.compiled.real, device=self._device),
+        )
         for start in range(0, call.rows, rows):
             block = slice(start, min(start + rows, call.rows))
             after, total = self._block(block, times, kept, at_times)
@@ -132,9 +137,9 @@ class Backward:
         sums = sum((x.numel() if shared else x[0].numel()) for x, shared in self._summed) * 8
         most = self._ran.budget // (4 * sums + 1)  # rows of which the sums fit
         if kept:
-            return max(unit, most // unit * unit), call.times
-        room = _CACHED * threads if self._on_processor else self._ran.budget
-        rows = max(unit, min(room // (size * call.times), most) // unit * unit)
+            return self._ran.rows if self._on_processor else max(unit, most // unit * unit), call.times
+        room = rows_at_once(size * call.times) if self._on_processor else call.rows
+        rows = max(unit, min(room, most) // unit * unit)
         held = min(rows, call.rows) * size
         if held * call.times <= self._ran.budget:
             return rows, call.times
@@ -153,10 +158,11 @@ class Backward:
         slopes, sums = self._slopes(rows), None
         for start, begin in zip(reversed(starts), reversed(begins), strict=True):
             piece = slice(start, min(start + times, call.times))
-            before = [x[rows] for x in kept] if kept else self._carries(rows, piece, begin, 1)
+            before = self._kept(kept, rows) if kept else self._carries(rows, piece, begin, 1)
             given = self._given(rows, piece, slopes, before, sums)
+            own = [column[rows] for column in self._read]
             assert self.built is not None
-            found = call.run(self.built, given, [column[rows] for column in self._read], 1, back=True)
+            found = call.run(self.built, given, own, 1, back=True, rooms=self._rooms(rows, piece, at_times))
             slopes, sums, slow = split(found, (len(slopes), len(self._summed), len(at_times.leaves)))
             at_times.put(rows, piece, slow)
         return slopes, sums or []
@@ -172,7 +178,22 @@ class Backward:
         count, length = rows.stop - rows.start, times.stop - times.start
         given = Given([*begin], now, row, self._call.structures, count, length)
         own = [column[rows] for column in self._own]
-        return self._call.run(self._ran.built, given, own, every, back=False)[-len(begin) :]
+        return self._call.run(self._ran.built, given, own, every)[-len(begin) :]
+
+    def _kept(self, kept: Sequence[Tensor], rows: slice) -> list[Tensor]:
+        """The carry before every time of some rows, of those that are kept, (blocks, T, ..., rows)."""
+        if len(kept[0]) == 1:
+            return [x[0].movedim(-1, 0)[rows] for x in kept]
+        block, count = rows.start // self._ran.rows, rows.stop - rows.start
+        return [x[block].movedim(-1, 0)[:count] for x in kept]
+
+    def _rooms(self, rows: slice, times: slice, at_times: _AtTimes) -> list[Tensor]:
+        """Where a block is written to: what times bring has its place among all rows."""
+        if not self._on_processor or not at_times.leaves or self.built is None:
+            return []
+        like, count = at_times.like, rows.stop - rows.start
+        ends = [empty_rows(like, count, (), shape) for shape, _ in self.built.compiled.carry]
+        return [*ends, *at_times.rooms(rows, times)]
 
     def _some(self, leaves: Sequence[Any], rows: slice, times: slice | None) -> list[Any]:
         if times is None:
@@ -225,37 +246,62 @@ class _AtTimes:
 
     Args:
         leaves: what they are by.
-        times: all of them.
+        rows, times: all of them.
+        like: dtype and device.
     """
 
-    def __init__(self, leaves: Sequence[Any], times: int) -> None:
-        self.leaves, self._times = leaves, times
-        self._found: list[list[Tensor]] = [[] for _ in leaves]
+    def __init__(self, leaves: Sequence[Any], rows: int, times: int, like: Tensor) -> None:
+        self.leaves, self.like = leaves, like
+        self._found: list[Tensor] = []
+        for leaf in leaves:
+            shared = isinstance(leaf, Shared)
+            shape, count = leaf.tensor.shape[1:] if shared else leaf.shape[2:], -(-rows // _UNIT)
+            self._found.append(empty_rows(like, count if shared else rows, (times,), shape))
+
+    def rooms(self, rows: slice, times: slice) -> list[Tensor]:
+        """Return where those of a block are written to."""
+        count, length = rows.stop - rows.start, times.stop - times.start
+        return [
+            empty_rows(self.like, count, (length,), leaf.tensor.shape[1:])
+            if isinstance(leaf, Shared)
+            else found[rows, times]
+            for leaf, found in zip(self.leaves, self._found, strict=True)
+        ]
 
     def put(self, rows: slice, times: slice, slopes: Sequence[Tensor]) -> None:
-        """Add those of a block, (rows, times, ...)."""
-        count, whole = rows.stop - rows.start, times.stop - times.start == self._times
+        """Add those of a block, (rows, times, ...), that are not in their place."""
         for leaf, slope, found in zip(self.leaves, slopes, self._found, strict=True):
             if isinstance(leaf, Shared):
-                slope = _units(slope)
-            elif not whole or count < len(leaf):
-                if not found:
-                    found.append(torch.empty_like(leaf))
-                found[0][rows, times] = slope
-                continue
-            if whole:
-                found.append(slope)
-                continue
-            if times.stop == self._times:
-                found.append(slope.new_empty((len(slope), self._times, *slope.shape[2:])))
-            found[-1][:, times] = slope
+                found[rows.start // _UNIT : -(-rows.stop // _UNIT), times] = _units(slope)
+            elif slope.data_ptr() != found[rows, times].data_ptr():
+                found[rows, times] = slope
 
     def joined(self) -> list[Tensor]:
         """Return those of all rows and times."""
         pairs = zip(self.leaves, self._found, strict=True)
         return [
-            _halved(_joined(f), 0).to(x.tensor.dtype) if isinstance(x, Shared) else f[0] for x, f in pairs
+            _halved(x, 0).to(of.tensor.dtype) if isinstance(of, Shared) else x.to(of.dtype) for of, x in pairs
         ]
+
+
+def rows_at_once(size: int) -> int:
+    """Return how many rows of so many bytes the caches of the processors hold, 64 a thread at least."""
+    threads = torch.get_num_threads()
+    unit = _UNIT * threads
+    return max(unit, _CACHED * threads // max(1, size) // unit * unit)
+
+
+def empty_rows(like: Tensor, rows: int, times: tuple[int, ...], shape: Sequence[int]) -> Tensor:
+    """Return an empty tensor (rows, *times, *shape) in whose memory the rows are innermost."""
+    size = torch.Size(shape).numel() * rows
+    strides = (1, *[size for _ in times], *inner_strides(shape, rows))
+    return fresh(like, *times, size).as_strided((rows, *times, *shape), strides)
+
+
+def some_rows(given: Given, rows: slice) -> Given:
+    """Return the inputs of some rows."""
+    leaves = ([x if isinstance(x, Shared) else x[rows] for x in part] for part in given[:3])
+    return Given(*leaves, given.structures, rows.stop - rows.start, given.times)
 
 
 def _units(x: Tensor) -> Tensor:

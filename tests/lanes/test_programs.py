@@ -141,7 +141,7 @@ def test_what_is_no_ordinary_tensor_runs_the_definition() -> None:
     x, u, row = inputs(3)
     wanted = PENDULUM.definition(x, u, row)[0]
     learned = nn.Parameter(x.clone())
-    assert not PENDULUM.compiles(learned, u, row)
+    assert PENDULUM.compiles(learned, u, row)  # its gradient is compiled, too
     PENDULUM(learned, u, row)[0].sum().backward()
     assert learned.grad is not None
     with torch.no_grad():
