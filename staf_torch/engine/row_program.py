@@ -12,14 +12,15 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..approximation.basis import GramStructure, Target
+from ..approximation.basis import GramStructure, StaFBasis, Target
 from ..lanes import Program
 from ..lanes.call import served
 from ..lanes.compiled_methods import worth
-from ..lanes.shared_programs import SharedPrograms, number
+from ..lanes.shared_programs import SharedPrograms
 from ..optim.base import UpdateLaw
 from ..optim.objective import NativeError, Objective, Precomputed
 from .certificate import Certificate, certify, first_link
+from .predictors import Predictor
 from .problem import Problem
 from .quantities import Known, Numbers, know, numbers, precompute, unless
 from .recursion import Carry, Corrected, Link, Moment, all_finite, correct
@@ -132,7 +133,7 @@ def first_carry(problem: Problem, carry: Carry) -> RowCarry:
 def program(problem: Problem, states: Tensor, carry: RowCarry, *, everything: bool) -> Program | None:
     """Return the program of a chase, None where the definition serves.
 
-    One that differs from another in tensors and gains alone takes over its text: `lanes.shared_programs`.
+    One that differs from another in numbers alone takes over its text: `lanes.shared_programs`.
 
     Args:
         problem: what is chased.
@@ -146,21 +147,17 @@ def program(problem: Problem, states: Tensor, carry: RowCarry, *, everything: bo
     owners = problem.basis, problem.target, problem.law, problem.predictor, *settings
     made = _kept.unchanged(*owners)
     if made is None:
-        problem = _numbers_as_tensors(problem)
-        parts = problem.basis, problem.target, problem.law, problem.predictor
-        made = _kept.of(Step(problem, everything), *parts, settings, owners=owners)
+
+        def make(
+            basis: StaFBasis, target: Target, law: UpdateLaw, predictor: Predictor | None, _: Any
+        ) -> Step:
+            other = copy.copy(problem)  # which was checked
+            vars(other).update(basis=basis, target=target, law=law, predictor=predictor)
+            return Step(other, everything)
+
+        parts = problem.basis, _plain(problem.target), problem.law, problem.predictor, settings
+        made = _kept.of(make(*parts), *parts, owners=owners, make=make)
     return made if made.compiles(carry, states) else None
-
-
-def _numbers_as_tensors(problem: Problem) -> Problem:
-    """Return the problem with the gains of the library's laws as tensors, which no text knows."""
-    law, target = problem.law, problem.target
-    if type(law).__module__.startswith(UpdateLaw.__module__.rpartition(".")[0]):
-        law = copy.copy(law)
-        for name, value in vars(law).items():
-            if isinstance(value, float):
-                setattr(law, name, number(name, value))
-    return _with(problem, law, _plain(target))
 
 
 def _plain(target: Target) -> Target:
@@ -168,12 +165,6 @@ def _plain(target: Target) -> Target:
     plain: Any = getattr(target, "_orig_mod", None) if isinstance(target, nn.Module) else None
     plain = plain if plain is not None else getattr(target, "_torchdynamo_orig_callable", None)
     return target if plain is None else plain
-
-
-def _with(problem: Problem, law: UpdateLaw, target: Target) -> Problem:
-    other = copy.copy(problem)  # which was checked
-    vars(other).update(law=law, target=target)
-    return other
 
 
 def _symmetric(gram: Tensor) -> Tensor:

@@ -17,6 +17,7 @@ import functools
 import hashlib
 import io
 import logging
+import math
 import operator
 import pickle
 import sys
@@ -53,6 +54,7 @@ IDLE = _OF_EVERY_MODULE - {*_READ}  # hooks of derivatives and of state_dicts, a
 _log = logging.getLogger(__name__)
 _said: set[tuple[str, str]] = set()  # what has been logged
 _MISSING = object()
+_TOLD = "a number of the table"
 _EMPTY = object()  # in a cell whose name has no value yet
 _REQUIRES, _VERSION = operator.attrgetter("requires_grad"), operator.attrgetter("_version")
 _BASE, _ARRAY = operator.itemgetter(*_READ), operator.methodcaller("tobytes")
@@ -100,16 +102,18 @@ class Contents:
 
     Args:
         objects: modules, tensors, functions, anything that can be pickled.
+        telling: whether floats of the library's objects count as tensors.
 
     Attributes:
         key: of the settings inside; None where something cannot be written down (an open file, a lock).
         tensors: the floating-point tensors that the key leaves out, in an order that equal keys share.
         reason: why there is no key, or what cannot be watched; None where all can.
         of_users: whether code of a user is among what objects hold or lead to, or nobody can say.
+        told: objects by their addresses, and tensors by the names of the floats that they stand for.
     """
 
-    def __init__(self, *objects: Any) -> None:
-        walk = self._walk = Walk(io.BytesIO())
+    def __init__(self, *objects: Any, telling: bool = False) -> None:
+        walk = self._walk = Walk(io.BytesIO(), telling)
         self.key: tuple[bytes, tuple[object, ...]] | None = None
         try:
             for each in objects:
@@ -120,6 +124,7 @@ class Contents:
         except Exception as error:  # of any object that a function names: a lock, a deep list, a proxy
             self.reason = f"{type(error).__name__}: {error}"
         self.tensors, self.of_users = walk.tensors, walk.of_users or self.key is None
+        self.told = walk.told
         kinds = (kind for each in walk.kept if isinstance(each, type) for kind in each.__mro__)
         classes = [kind for kind in dict.fromkeys(kinds) if kind is not object]
         self._users = [vars(kind) for kind in classes if is_users(kind)]
@@ -239,6 +244,15 @@ def _makes_parameters(kind: type) -> bool:
     )
 
 
+@functools.lru_cache(maxsize=4096)
+def number(place: int, value: float) -> Tensor:
+    """Return a float64 tensor of a number that no text is to know: of a place and a number always the same.
+
+    Two places never share one: a text would then know that their numbers are equal.
+    """
+    return torch.tensor(value, dtype=torch.float64, device="cpu")
+
+
 class _Same:
     """An object as a key: equal to itself alone, and kept, so that its address is used once."""
 
@@ -316,9 +330,10 @@ def _content_of(cell: CellType) -> Any:
 class Walk(pickle.Pickler):
     """Writes everything but floating-point tensors, and notes what may change later."""
 
-    def __init__(self, file: io.BytesIO) -> None:
+    def __init__(self, file: io.BytesIO, telling: bool = False) -> None:
         super().__init__(file)
-        self.file = file
+        self.file, self._telling = file, telling
+        self.told: dict[int, tuple[Any, dict[str, Tensor]]] = {}
         self.kept: list[object] = []  # part of the key: an address is used once
         self.tensors: list[Tensor] = []
         self.others: list[Tensor] = []  # whose numbers are part of the key
@@ -374,16 +389,37 @@ class Walk(pickle.Pickler):
             hooks = {k: tuple(v.values()) for k, v in state.items() if k.endswith("_hooks") and v}
             self.dicts += [state[k] for k in hooks]
             state |= hooks
+            if self._telling:
+                self._tell(value, state)
             self._states[id(state)] = state
             own = [k for k in vars(value) if k in state and k not in _OF_EVERY_MODULE]
             self.modules.append((vars(value), own))
             return copyreg.__newobj__, (type(value),), state  # type: ignore[attr-defined]
-        if BOUND in getattr(value, "__dict__", ()):
+        held = getattr(value, "__dict__", ())
+        if BOUND in held or (held and self._telling and getattr(type(value), "told", ())):
             made = list(value.__reduce_ex__(2))
             made[2] = {k: v for k, v in made[2].items() if k != BOUND}
+            if self._telling:
+                self._tell(value, made[2])
             self._states[id(made[2])] = made[2]
             return tuple(made)
         return NotImplemented
+
+    def _tell(self, value: Any, state: dict[str, Any]) -> None:
+        """Put tensors in the place of the finite floats of an object of the library, in its state."""
+        kind = type(value)
+        names = getattr(kind, "told", ())
+        if not names or is_users(kind):
+            return
+        told = {}
+        for name in [*state] if names is True else names:
+            real = state.get(name)
+            if type(real) is float and math.isfinite(real):
+                told[name] = number(len(self.tensors), real)
+                self.tensors.append(told[name])
+                state[name] = _TOLD
+        if told:
+            self.told[id(value)] = value, told
 
     def persistent_id(self, value: Any) -> Any:
         kind = type(value)

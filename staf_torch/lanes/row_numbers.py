@@ -175,6 +175,11 @@ def in_use() -> bool:
     return RowNumbers.made and getattr(_active, "resolve", None) is None
 
 
+def nonzero(number: Any) -> bool:
+    """Return whether a number is not 0; numbers of rows count as such, as a row may have another."""
+    return isinstance(number, RowNumbers) or bool(number)
+
+
 def all_rows(tensor: Tensor) -> Tensor:
     """Return the memory of a tensor: (B, ...) of numbers of rows, itself of others."""
     return tensor.full if isinstance(tensor, RowNumbers) else tensor

@@ -126,6 +126,8 @@ class Rowwise(abc.ABCMeta):
             _serve_rows()
         return made
 
+    told = True  # `told_numbers`: floats of the library's own classes are numbers of a table
+
 
 class OfRows(Rowwise):
     """Metaclass of modules whose constructors decide by values: with numbers of rows they run row by row."""

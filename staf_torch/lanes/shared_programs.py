@@ -2,30 +2,21 @@
 
 from __future__ import annotations
 
-import functools
 import logging
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from operator import is_
 from typing import Any, NamedTuple
 
-import torch
 from torch import Tensor
 
 from .contents import Contents, version
 from .locks import Mutex
+from .loops import traced_as
 from .program import Program
+from .told_numbers import leads_by_copies, told_copies
 from .trace.step import Step
 
 _log = logging.getLogger(__name__)
-
-
-@functools.lru_cache(maxsize=4096)
-def number(name: str, value: float) -> Tensor:
-    """Return the tensor of a number that no text is to know, float64: of a name and a number always the same.
-
-    Two names never share one: a text would then know that their numbers are equal.
-    """
-    return torch.tensor(value, dtype=torch.float64, device="cpu")
 
 
 class _KeptModel(NamedTuple):
@@ -71,7 +62,14 @@ class SharedPrograms:
             return None
         return program
 
-    def of(self, step: Step, *parts: Any, copies: int = 0, owners: tuple[Any, ...] = ()) -> Program:
+    def of(
+        self,
+        step: Step,
+        *parts: Any,
+        copies: int = 0,
+        owners: tuple[Any, ...] = (),
+        make: Callable[..., Step] | None = None,
+    ) -> Program:
         """Return the program of a step.
 
         Args:
@@ -80,8 +78,12 @@ class SharedPrograms:
                 down is known to be equal to nothing.
             copies: as in `Program`.
             owners: objects and settings that decide what the parts are, for `unchanged`.
+            make: the step of ``parts``, all of which come to it by these arguments: floats of the library's
+                objects among them are then numbers of the table, too.
         """
-        read = Contents(copies, *parts)
+        read = Contents(copies, *parts, telling=make is not None)
+        if read.told and read.key not in self._models and not leads_by_copies(read, parts):
+            read = Contents(copies, *parts)
         if read.key is None:
             if not self._warned:
                 self._warned = True
@@ -92,20 +94,33 @@ class SharedPrograms:
             return new
         tensors = read.tensors
         versions = [*map(version, tensors)]
+        floats = read.told
+
+        def spelled() -> Step:
+            """The step, in a trace of copies that have tensors in the place of floats."""
+            if make is None or not floats:
+                return step
+            return traced_as(lambda *given: make(*told_copies(floats, parts))(*given))(step)
+
         with self._lock:
-            return self._found(step, read, versions, copies, owners)
+            return self._found(spelled, read, versions, copies, owners)
 
     def _found(
-        self, step: Step, read: Contents, versions: list[int], copies: int, owners: tuple[Any, ...]
+        self,
+        step: Callable[[], Step],
+        read: Contents,
+        versions: list[int],
+        copies: int,
+        owners: tuple[Any, ...],
     ) -> Program:
         """Return the program of what a step reads: the kept one, one that follows from it, or a new one."""
         tensors, held = read.tensors, self._models.pop(read.key, None)
         if held is None or read.replaced(held.methods):
-            new, signature = Program(step, name=self._name, copies=copies), read.signature()
+            new, signature = Program(step(), name=self._name, copies=copies), read.signature()
             new.described(signature, tensors)
             held = _KeptModel(new, tensors, new, tensors, versions, signature, read.methods())
         elif held.versions != versions or not all(map(is_, held.tensors, tensors)):
-            new = held.traced.with_others(step, list(zip(held.found, tensors, strict=True)))
+            new = held.traced.with_others(step(), list(zip(held.found, tensors, strict=True)))
             new.described(held.signature, tensors)
             held = held._replace(last=new, tensors=tensors, versions=versions)
         self._models[read.key] = held
@@ -120,7 +135,9 @@ class SharedPrograms:
         return held.last
 
 
-def shared_program(name: str, step: Step, *parts: Any, copies: int = 0) -> Program:
+def shared_program(
+    name: str, step: Step, *parts: Any, copies: int = 0, make: Callable[..., Step] | None = None
+) -> Program:
     """Return the program of a step, shared with steps of the name that differ in tensors alone.
 
     Example:
@@ -133,9 +150,9 @@ def shared_program(name: str, step: Step, *parts: Any, copies: int = 0) -> Progr
 
     Args:
         name: in the log.
-        step, parts, copies: as in `SharedPrograms.of`.
+        step, parts, copies, make: as in `SharedPrograms.of`.
     """
-    return _kinds.setdefault(name, SharedPrograms(name)).of(step, *parts, copies=copies)
+    return _kinds.setdefault(name, SharedPrograms(name)).of(step, *parts, copies=copies, make=make)
 
 
 _kinds: dict[str, SharedPrograms] = {}

@@ -9,6 +9,8 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from ..lanes.row_numbers import nonzero
+
 SHARES = (0.0, 0.5, 0.5, 1.0)
 """Of the step, at which its four stages stand."""
 
@@ -65,13 +67,24 @@ def runge_kutta_mean(values: Sequence[Tensor], dt: float | Tensor) -> Tensor:
     return (dt / 6) * (first + 2 * (second + third) + last)
 
 
+def exponential(exponent: float | Tensor) -> float | Tensor:
+    """e^exponent."""
+    return exponent.exp() if isinstance(exponent, Tensor) else math.exp(exponent)
+
+
 def stage_weights(length: float | Tensor, discount: float, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return where the stages stand, and weights of slopes and costs, s: (4, ..., 1) twice, (4, ...)."""
     if not isinstance(length, Tensor):
-        h, left = length, math.exp(-0.5 * discount * length)  # what the middle still counts; the end, squared
+        h = length
+        # What the middle still counts; the end, squared.
+        counts = exponential(-0.5 * discount * h) if nonzero(discount) else 1.0
+        left = 1.0 if isinstance(counts, Tensor) else counts
         between = (h / 2, h / 3, left * h / 3)
         table = ((0.0, h / 6, h / 6), between, between, (h, h / 6, left**2 * h / 6))
         asked, counted, worth = torch.tensor(table, dtype=like.dtype, device=like.device).unbind(-1)
+        if isinstance(counts, Tensor):  # of a row's own, or of the table
+            shares = torch.stack((torch.ones_like(counts), counts, counts, counts.square()))
+            worth = counted * shares.to(like)
         return asked.unsqueeze(-1), counted.unsqueeze(-1), worth
     half = torch.exp(-0.5 * discount * length)
     ends, middle = length / 6, length / 3

@@ -15,6 +15,7 @@ from ..lanes.compiled_methods import undecided, worth
 from ..lanes.loop_program import LoopProgram
 from ..lanes.opaque import opaque
 from ..lanes.row_numbers import over_rows, over_some_rows, some_rows
+from ..lanes.trace.step import Step
 from ..lanes.tree import Tree
 from ..numerics.checks import integer, positive_real, trailing
 from ..numerics.default_device import beside
@@ -93,17 +94,21 @@ def _stepped(
 ) -> Program | LoopProgram:
     """Steps of dt in so many Runge-Kutta steps, which record the state before every one."""
 
-    def step(now: Tracked, given: Tree, row: Tree) -> tuple[Tracked, Tensor]:
-        x, bent, reach = now
-        after, more = _advanced(system, x, dt, count)
-        bent, size = torch.where(more <= bent, bent, more), x.abs().amax(-1)
-        return (after, bent, torch.where(size <= reach, reach, size)), x
+    def tracked(system: ControlAffineSystem, dt: float, count: int) -> Step:
+        def step(now: Tracked, given: Tree, row: Tree) -> tuple[Tracked, Tensor]:
+            x, bent, reach = now
+            after, more = _advanced(system, x, dt, count)
+            bent, size = torch.where(more <= bent, bent, more), x.abs().amax(-1)
+            return (after, bent, torch.where(size <= reach, reach, size)), x
+
+        return step
 
     def untracked(now: Tracked, given: Tree, row: Tree) -> tuple[Tracked, Tensor]:
         return (_advanced(system, now[0], dt, count)[0], *now[1:]), now[0]
 
     def compiled() -> Program:
-        return shared_program("a trajectory", step, system, dt, count)
+        parts = system, dt, count
+        return shared_program("a trajectory", tracked(*parts), *parts, make=tracked)
 
     if worth(count * times * (1 + rows / 200) >= _PAYS):
         return compiled()

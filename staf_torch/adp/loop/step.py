@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from ...lanes import Program, shared_program
-from ...lanes.shared_programs import number
+from ...lanes.row_numbers import nonzero
 from ...lanes.tree import flatten, unflatten
 from ...numerics.angles import wrap
 from ...numerics.checks import choice, copied, fail, flag, positive_real
@@ -127,7 +127,7 @@ class ClosedLoop(nn.Module):
         alive = state.alive & good
         pairs = zip(parts[0], before[0], strict=True)
         kept = unflatten(parts[1], (_where(alive, new, old) for new, old in pairs))
-        if self.cost.discount:
+        if nonzero(self.cost.discount):
             spent = spent * torch.exp(-self.cost.discount * self.dt * state.lived)
         cost = state.cost + torch.where(alive, spent, 0.0)
         bent = torch.maximum(bent, state.bent)  # of what is not a number: that
@@ -151,8 +151,7 @@ def _where(alive: Tensor, new: Tensor, old: Tensor) -> Tensor:
 def program(loop: ClosedLoop, compile: bool) -> Program:
     """Return ``loop`` over many steps: it records the state before every step, and the control.
 
-    Compiled loops that differ in tensors and in the controller's `numbers` alone share one text:
-    `lanes.shared_programs`.
+    Compiled loops that differ in numbers alone share one text: `lanes.told_numbers`.
 
     Args:
         loop: one step.
@@ -160,15 +159,10 @@ def program(loop: ClosedLoop, compile: bool) -> Program:
     """
     if not compile:
         return Program(functools.partial(recorded, loop), name="the closed loop", compile=False)
-    numbers = loop.controller.numbers()
-    # Numbers of all rows as tensors, which no text knows; a row's own ones come with the row.
-    shared = {name: number(name, value) for name, value in numbers.items() if not isinstance(value, Tensor)}
-
-    def step(state: LoopState, uniform: Tensor, own: Mapping[str, Tensor]) -> tuple[LoopState, Record]:
-        return recorded(loop, state, uniform, {**shared, **dict(own)})
-
-    parts = loop.with_numbers({**shared, **dict.fromkeys(row_numbers(loop))}) if numbers else loop
-    return shared_program("the closed loop", step, parts)
+    own = row_numbers(loop)  # which come with the row
+    read = loop.with_numbers(dict.fromkeys(own)) if own else loop
+    make = functools.partial(functools.partial, recorded)
+    return shared_program("the closed loop", make(loop), read, make=make)
 
 
 def row_numbers(loop: ClosedLoop) -> dict[str, Tensor]:

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor, nn
 
+from ...lanes.row_numbers import nonzero
 from ...lanes.row_objects import OfRows, by_rows
 from ...numerics.angles import periods_of, turned, wrap, wrap_each
 from ...numerics.box import LARGEST, box_minimum, face_inverses
@@ -90,7 +91,7 @@ class Cost(nn.Module, metaclass=OfRows):
         target: Sequence[float] | Tensor | None = None,
         target_input: Sequence[float] | Tensor | None = None,
         output: Output | None = None,
-        discount: float = 0.0,
+        discount: float | Tensor = 0.0,
         terminal: Matrix | EndValue | None = None,
     ) -> None:
         super().__init__()
@@ -175,7 +176,11 @@ class Cost(nn.Module, metaclass=OfRows):
 
     def extra_repr(self) -> str:
         given: dict[str, Any] = {"target": self.target, "target_input": self.target_input}
-        given |= {"output": self.output, "discount": self.discount or None, "terminal": self.ending}
+        given |= {
+            "output": self.output,
+            "discount": self.discount if nonzero(self.discount) else None,
+            "terminal": self.ending,
+        }
         parts = [f"{name}={shown(value)}" for name, value in given.items() if value is not None]
         rates = f"state={shown(self.q)}, control={shown(self.r)}"
         return ", ".join([sizes(self.dim, self.inputs), rates, *limits(self.bounds), *parts])
@@ -192,7 +197,7 @@ class Cost(nn.Module, metaclass=OfRows):
     def plain(self) -> bool:
         """True where this is x'Qx + U(u) at the origin: no set-point, output, bounds or discount."""
         stated = (self.target, self.target_input, self.output, self.bounds)
-        return all(one is None for one in stated) and not self.discount
+        return all(one is None for one in stated) and not nonzero(self.discount)
 
     def deviation(self, x: Tensor) -> Tensor:
         """x - target, angles in [-pi, pi]: (..., n) -> (..., n)."""

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ...lanes import repeat, scan
 from ...lanes.loops import untraced
-from ...lanes.row_numbers import each_row, met_rows
+from ...lanes.row_numbers import each_row, met_rows, nonzero
 from ...numerics.checks import integer, positive_real
 from ...numerics.exponential_step import (
     GRACE,
@@ -26,7 +26,7 @@ from ...numerics.exponential_step import (
     fewest_steps,
     times,
 )
-from ...numerics.runge_kutta import stage_weights
+from ...numerics.runge_kutta import exponential, stage_weights
 from ...systems import Clocked, Plant, StepPlant
 from .cost import Cost
 from .held_linear import periods
@@ -90,6 +90,8 @@ class Holding:
     Raises:
         ValueError: if ``dt`` is not positive, or no multiple of the plant's period.
     """
+
+    told = ("error", "discount")
 
     def __init__(
         self,
@@ -177,12 +179,12 @@ class Holding:
         length = self.dt / self.steps
         if self.steps == 1:
             return self._step(x, u, length, watch)
-        decay, zero = math.exp(-self.discount * length), torch.zeros_like(x[..., 0])
+        decay, zero = exponential(-self.discount * length), torch.zeros_like(x[..., 0])
 
         def substep(now: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
             x, spent, share, most = now
             after, paid, *bent = self._step(x, u, length, watch)
-            spent = spent + share * paid if self.discount else spent + paid
+            spent = spent + share * paid if nonzero(self.discount) else spent + paid
             return after, spent, decay * share, torch.maximum(most, bent[0]) if bent else most
 
         x, spent, _, most = repeat(self.steps, substep, (x, zero, zero + 1.0, zero))
@@ -204,7 +206,7 @@ class Holding:
                 length = torch.where(limit < length, limit, length)
             length = torch.where(count > 1, length, left)
             after, paid, bent = self._classical(x, u, length, watch=True)
-            if self.discount:
+            if nonzero(self.discount):
                 paid = paid * torch.exp(-self.discount * (self.dt - left))
             return after, u, spent + paid, left - length, count - 1, torch.maximum(most, bent)
 
@@ -250,7 +252,7 @@ class Holding:
         paid = none
         if cost is not None:
             shares = stage_weights(h, self.discount, x)[2]
-            whole = h if not self.discount else -math.expm1(-self.discount * h) / self.discount
+            whole = h if not nonzero(self.discount) else -math.expm1(-self.discount * h) / self.discount
             paid = whole * cost.input_rate(u)
             if not still:  # what the rate differs from the quadratic form around the start, by Simpson's rule
                 paid = paid + (shares.reshape(-1, *[1] * none.dim()) * rates).sum(0)

@@ -203,6 +203,8 @@ class _TorchFunctions(TorchFunctionMode):
                 return plain(*args, **kwargs)
         if name in _LEAVES_TORCH and isinstance(args[0], Tensor) and self._traced(args[0]):
             raise NotLoweredError(f"`Tensor.{name}` takes numbers of a row out of torch", name)
+        if name == "__bool__" and args[0].is_floating_point():  # other numbers may be as true as this
+            return bool(args[0] != 0)
         return func(*args, **kwargs)
 
 
