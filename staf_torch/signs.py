@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import functools
 import logging
 import multiprocessing
 import os
@@ -21,8 +22,9 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
+_P, _R = ParamSpec("_P"), TypeVar("_R")
 _log = logging.getLogger(__name__)
 FIRST, EVERY = 1.5, 10.0
 """s before anything is shown, and from a line to the next."""
@@ -35,7 +37,7 @@ _watch: threading.Thread | None = None
 _drawn = False  # whether a terminal shows a line that is to be wiped
 
 
-class Sign(contextlib.ContextDecorator):
+class Sign:
     """Context, or decorator, of what may take long.
 
     Example:
@@ -60,8 +62,16 @@ class Sign(contextlib.ContextDecorator):
         self._what, self.total, self.unit, self._log = what, total, unit, log
         self.done, self._began, self._said = 0.0, 0.0, -EVERY
 
-    def _recreate_cm(self) -> Sign:  # of a decorated function, each call has its own
-        return Sign(self._what, self.total, self.unit, log=self._log)
+    def __call__(self, function: Callable[_P, _R]) -> Callable[_P, _R]:
+        """Decorate a function of which each call has a sign of its own."""
+        what, total, unit, log = self._what, self.total, self.unit, self._log
+
+        @functools.wraps(function)
+        def shown(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+            with Sign(what, total, unit, log=log):
+                return function(*args, **kwargs)
+
+        return shown
 
     def __enter__(self) -> Sign:
         self._began, self._stack = self._began or time.monotonic(), _signs()  # may go on after a pause
@@ -73,9 +83,12 @@ class Sign(contextlib.ContextDecorator):
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self not in self._stack:
+        if self._stack and self._stack[-1] is self:
+            self._stack.pop()
+        elif self in self._stack:
+            del self._stack[self._stack.index(self) :]  # with those of generators that an error has left open
+        else:
             return
-        del self._stack[self._stack.index(self) :]  # with those of generators that an error has left open
         if not self._stack:
             with _lock:
                 if _open.pop(id(self._stack), None) is not None:

@@ -202,7 +202,6 @@ class StaFBasis(nn.Module, metaclass=Rowwise):
         )
         return True
 
-    @torch.no_grad()
     def check_learned(self) -> None:
         """Refuse learned hyperparameters that have left their rules, before a compiled program reads them.
 
@@ -211,7 +210,8 @@ class StaFBasis(nn.Module, metaclass=Rowwise):
         """
         if learns(self):
             zero = self.centers.directions.new_zeros(1, self.dim)
-            self(zero.unsqueeze(-2) + 1, zero)
+            with torch.no_grad():
+                self(zero.unsqueeze(-2) + 1, zero)
 
     @torch.no_grad()
     def _own_change(self, x: Tensor) -> float:

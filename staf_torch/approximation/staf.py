@@ -147,7 +147,7 @@ class StaF(nn.Module):
             )
         refuse_gradient("StaF.fit_", x=x, target=target)
         if x.numel():
-            check_target(target, x.reshape(-1, x.shape[-1])[0], self.out_features, sizes=x.shape)
+            check_target(target, x, self.out_features)
         with torch.no_grad():
             x = _wide(x.to(self.state))
             self.basis.check_reach(x)

@@ -57,9 +57,10 @@ class Problem:
             raise ValueError(
                 f"`{self.call}(states=...)` must have the shape (B, T, n); got {tuple(states.shape)}."
             )
-        if self.basis.centers.directions.is_meta:
+        directions = self.basis.centers.directions
+        if directions.is_meta:
             raise fail(self.call, "basis", "must have its values: it was built on the meta device", None)
-        check_target(self.target, states[0, 0], sizes=(*states.shape, self.basis.count))
+        check_target(self.target, states, sizes=directions.shape)
 
     def values(self, x: Tensor) -> Tensor:
         """Return V(c(x)) at the states x (..., n): (..., M)."""

@@ -83,34 +83,37 @@ Where = bool | torch.device
 processor: Where = True  # of tensors on the CPU; `device.host` has it be a device
 
 
-def ordinary(leaves: Sequence[Any]) -> Where:
+def ordinary(leaves: Sequence[Any], *, recorded: bool | None = None) -> Where:
     """Return where plain tensors are of which nobody wants a derivative, False of others.
 
     All that is given to compiled code passes here: dense, of no subclass, without a pending sign, on the CPU
     or one CUDA device. Under a tracer, a transform of torch.func or another mode the operations themselves
     are wanted.
+
+    Args:
+        leaves: the tensors, `Shared` ones among them.
+        recorded: whether one that requires a gradient is refused; None where autograd is on.
     """
     if seen_by_others():
         return False
-    recorded = torch.is_grad_enabled()
+    recorded = torch.is_grad_enabled() if recorded is None else recorded
     for leaf in leaves:
         tensor = plain(leaf)
         if type(tensor) not in _TENSORS or (recorded and tensor.requires_grad) or tensor.is_neg():
             return False
         if not tensor.is_cpu:
-            return _one_device(leaves)
+            return _one_device(leaves, recorded)
     return processor
 
 
 def served(leaves: Sequence[Any]) -> Where:
     """Return where plain tensors are, as `ordinary`, also where a derivative is wanted."""
-    with torch.no_grad():
-        return ordinary(leaves)
+    return ordinary(leaves, recorded=False)
 
 
-def _one_device(leaves: Sequence[Any]) -> Where:
+def _one_device(leaves: Sequence[Any], recorded: bool) -> Where:
     """Return the CUDA device where plain tensors are, single numbers aside; False where there is none."""
-    found, recorded = set[torch.device](), torch.is_grad_enabled()
+    found = set[torch.device]()
     for leaf in leaves:
         tensor = plain(leaf)
         if type(tensor) not in _TENSORS or (recorded and tensor.requires_grad) or tensor.is_neg():

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import weakref
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Hashable, Sequence
 from typing import Any
 
 import torch
@@ -81,6 +81,25 @@ def check_rows(
             raise ValueError(f"{told}, of floating point; got {found.dtype}.")
 
 
+def once(function: Any, kind: Hashable, check: Callable[[], None]) -> None:
+    """Call a check of a function the first time in a process that it comes with this kind of problem.
+
+    Args:
+        function: of a user; of this library's nothing is checked.
+        kind: what else decides: the check, sizes.
+        check: raises where the function breaks its rule.
+    """
+    holder, kind = getattr(function, "__self__", function), (getattr(function, "__func__", None), kind)
+    try:
+        known = _known.setdefault(holder, set())
+    except TypeError:  # what has no hash, or no weak reference
+        known = set()
+    if kind not in known:
+        if not is_ours(function):
+            check()
+        known.add(kind)
+
+
 def check_target(
     target: Callable[[Tensor], Any], x: Tensor, outputs: int | None = None, *, sizes: Collection[int] = ()
 ) -> None:
@@ -88,24 +107,18 @@ def check_target(
 
     Args:
         target: of points (..., n).
-        x: one of them, (n,).
+        x: some of them, (..., n), of which one is tried.
         outputs: k; None for one number.
         sizes: of the problem.
     """
-    holder, kind = getattr(target, "__self__", target), (getattr(target, "__func__", None), len(x), outputs)
-    try:
-        known = _known.setdefault(holder, set())
-    except TypeError:  # what has no hash, or no weak reference
-        known = set()
-    if kind in known:
-        return
-    name = getattr(target, "__name__", type(target).__name__)
-    inner = () if outputs is None else (outputs,)
-    if not is_ours(target):
-        form = "(...)" if outputs is None else f"(..., {outputs})"
+
+    def check() -> None:
+        name = getattr(target, "__name__", type(target).__name__)
+        form, inner = ("(...)", ()) if outputs is None else (f"(..., {outputs})", (outputs,))
         rule = (
             "The target `{what}` must map points of shape (..., n) to values of shape "
             f"{form}: " + "{given} must give {returned}"
         )
-        check_rows(name, target, [x], inner, sizes=sizes, rule=rule)
-    known.add(kind)
+        check_rows(name, target, [x.reshape(-1, x.shape[-1])[0]], inner, sizes=(*sizes, *x.shape), rule=rule)
+
+    once(target, (x.shape[-1], outputs), check)
