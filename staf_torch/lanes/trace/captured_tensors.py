@@ -34,7 +34,7 @@ class Recipe(NamedTuple):
     ]  # function, arguments, and what it returned
     reads: list[tuple[Tensor, np.ndarray[Any, Any]]]  # a tensor, and which places of its memory
     found: list[Tensor]  # floating-point tensors that were there before
-    checks: list[tuple[Tensor, Any]]  # numbers that the step itself read, and so depends on
+    checks: list[tuple[Tensor, Any]]  # numbers that the step itself read, and depends on; lists of all
 
     def again(self, others: Mapping[int, Tensor]) -> Tensor | None:
         """The numbers with other tensors in place of those found; None where the program would be another."""
@@ -110,6 +110,11 @@ class Captured:
                     self._recognise(address, function, args, kwargs)
             elif not known and address not in before:
                 self._made[address] = storage, True
+
+    def taken(self, tensor: Tensor) -> None:
+        """Note that numbers leave torch: what the step does with them is part of the text."""
+        if not self.stated(tensor):
+            self._checks.append((tensor, [tensor.detach().tolist()]))
 
     def _written_here(self, fresh: Sequence[Tensor]) -> None:
         """Return whether `torch.tensor` just made it of Python's numbers, not of memory of NumPy."""
@@ -242,4 +247,6 @@ def _swapped(value: Any, known: Mapping[int, Tensor]) -> Any:
 
 
 def _same(tensor: Tensor, value: Any) -> bool:
+    if isinstance(value, list):
+        return [tensor.tolist()] == value
     return tensor.numel() == 1 and bool(tensor.item() == value)

@@ -23,7 +23,7 @@ from ..row_numbers import RowNumbers, resolving
 from ..tree import Shared, Tree, flatten, plain
 from . import eigenvalues, factorisations
 from . import reductions as reductions  # its rules
-from .captured_tensors import Recipe
+from .captured_tensors import Recipe, tensors
 from .decompositions import REPLACEMENTS
 from .entrywise import RULES
 from .graph import NOW, STEP, Graph
@@ -117,7 +117,7 @@ def trace(step: Step, given: Given, *, widened: bool = False, folded: bool = Fal
                 own[id(numbers)] = numbers, tracer.input(like, "row", slot)[0]
             return own[id(numbers)][1]
 
-        with tracer, tracing(tracer), resolving(one), _TorchFunctions(tracer.traced):
+        with tracer, tracing(tracer), resolving(one), _TorchFunctions(tracer):
             try:
                 after, out = step(given.tree("carry", carry), now, row)
             except NotLoweredError:
@@ -185,9 +185,9 @@ class _TorchFunctions(TorchFunctionMode):
     input; `isfinite` compares twice.
     """
 
-    def __init__(self, traced: Callable[[Tensor], bool]) -> None:
+    def __init__(self, tracer: Tracer) -> None:
         super().__init__()
-        self._traced = traced
+        self._traced, self._captured = tracer.traced, tracer.captured
 
     def __torch_function__(
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
@@ -201,14 +201,19 @@ class _TorchFunctions(TorchFunctionMode):
                 chosen = wrapped or self._traced(args[0])
             if chosen:
                 return plain(*args, **kwargs)
-        if name in _LEAVES_TORCH and isinstance(args[0], Tensor) and self._traced(args[0]):
-            raise NotLoweredError(f"`Tensor.{name}` takes numbers of a row out of torch", name)
+        if name in _LEAVES_TORCH and not (name in _MAKES and isinstance(args[0], Tensor)):
+            for tensor in tensors(args[:1]):
+                if self._traced(tensor) and name not in _MAKES:
+                    raise NotLoweredError(f"`Tensor.{name}` takes numbers of a row out of torch", name)
+                if not self._traced(tensor):
+                    self._captured.taken(tensor)
         if name == "__bool__" and args[0].is_floating_point():  # other numbers may be as true as this
             return bool(args[0] != 0)
         return func(*args, **kwargs)
 
 
-_LEAVES_TORCH = ("numpy", "__array__", "tolist", "__dlpack__")
+_MAKES = ("tensor", "as_tensor", "asarray")  # of numbers, also those of tensors in lists
+_LEAVES_TORCH = ("numpy", "__array__", "tolist", "__dlpack__", "__repr__", *_MAKES)
 _PLAIN: dict[Any, Callable[..., Any]] = {
     torch.linalg.eigvalsh: eigenvalues.eigenvalues,
     torch.nn.functional.one_hot: _one_hot,
