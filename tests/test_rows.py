@@ -32,18 +32,6 @@ PLANTS: dict[str, tuple[Make, dict[str, tuple[float, float]]]] = {
     "van_der_pol": (systems.VanDerPol, {"damping": (0.5, 2.0)}),
     "oscillator": (systems.Oscillator, {"frequency": (0.5, 2.0)}),
 }
-LAWS: dict[str, tuple[Make, tuple[float, float]]] = {
-    "fixed step": (optim.FixedStep, (0.2, 0.9)),
-    "heavy ball": (lambda v: optim.HeavyBall(1.0, v), (0.2, 0.9)),
-    "nesterov": (lambda v: optim.Nesterov(0.9, v), (0.2, 0.9)),
-    "normalised lms": (optim.NormalisedLMS, (0.2, 0.9)),
-    "recursive least squares": (lambda v: optim.RecursiveLeastSquares(0.0, v), (1e-3, 1e-2)),
-}
-KERNELS: dict[str, tuple[Make, tuple[float, float]]] = {
-    "gaussian": (st.GaussianKernel, (0.5, 1.5)),
-    "matern": (lambda v: st.MaternKernel(2.5, v), (0.8, 1.5)),
-    "rational_quadratic": (lambda v: st.RationalQuadraticKernel(v, 0.9), (1.0, 2.0)),
-}
 
 
 class Spring(systems.ControlAffineSystem):
@@ -97,38 +85,6 @@ def test_a_users_plant_and_cost_run_in_a_closed_loop_under_a_policy_for_all_and_
             torch.testing.assert_close(run.state[row], alone.state[0], rtol=1e-14, atol=1e-14)
             torch.testing.assert_close(run.cost[row], alone.cost[0], rtol=1e-14, atol=1e-14)
     torch.testing.assert_close(own(x0), torch.cat([adp.LQR(*each)(x0[:1]) for each in one]))
-
-
-@pytest.mark.parametrize("name", KERNELS)
-def test_a_chase_whose_widths_and_radii_differ_is_the_loop_of_chases(name: str, either: str) -> None:
-    kind, ends = KERNELS[name]
-    radii, widths = spread(0.05, 0.2), spread(*ends)
-
-    def basis(width: Any, radius: Any) -> st.StaFBasis:
-        return st.StaFBasis(kind(width), st.StateFollowingCenters(st.rings(3), radius))
-
-    x0 = torch.tensor([[1.0, 0.0]]).double() * spread(0.5, 1.0)[:, None]
-    states = systems.simulate(systems.Oscillator(), x0, dt=0.01, steps=20)
-    law, target = optim.SteepestDescent(), targets.Paper()
-    many = st.chase(states, basis(st.rows(widths), st.rows(radii)), target, law)
-    for row in range(ROWS):
-        alone = st.chase(states[row : row + 1], basis(widths[row], radii[row]), target, law)
-        torch.testing.assert_close(many.weights[row], alone.weights[0], rtol=1e-9, atol=1e-9)
-        torch.testing.assert_close(many.estimate[row], alone.estimate[0], rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.parametrize("name", LAWS)
-def test_laws_of_rows_are_the_loop_of_single_ones(name: str) -> None:
-    make, ends = LAWS[name]
-    basis = st.StaFBasis(st.GaussianKernel(0.7), st.StateFollowingCenters(st.rings(3), 0.1))
-    x0 = torch.tensor([[1.0, 0.0]]).double() * spread(0.5, 1.0)[:, None]
-    states = systems.simulate(systems.Oscillator(), x0, dt=0.01, steps=20)
-    many = st.chase_weights(states, basis, targets.Paper(), make(st.rows(spread(*ends)))).weights
-    for row in range(ROWS):
-        law = make(float(spread(*ends)[row]))
-        assert torch.equal(
-            st.chase_weights(states[row : row + 1], basis, targets.Paper(), law).weights[0], many[row]
-        )
 
 
 def test_scenes_with_discs_of_their_own_stand_behind_one_filter() -> None:

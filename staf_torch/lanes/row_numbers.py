@@ -350,6 +350,8 @@ def _mapped(function: Callable[..., Some], given: tuple[Tree, ...], met: RowNumb
 def _decides(error: RuntimeError) -> bool:
     """Return whether a function read a value under `vmap`, which its rows alone may do."""
     text = str(error)
+    if "storage of BatchedTensorImpl" in text or "data pointer of Tensor that doesn't have storage" in text:
+        return True  # a Python number or an array of NumPy is wanted
     return "vmap" in text and ("data-dependent" in text or ".item()" in text or "dynamic shape" in text)
 
 
@@ -371,10 +373,7 @@ def _operation(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
     if name in _STRUCTURE:
         return func(full[0].detach()[0], *args[1:], **kwargs)
     if name in _READS:
-        raise ValueError(
-            f"`Tensor.{name}` of `rows(...)`: a number that differs from row to row has no single value; "
-            "compute with it in torch, or read `.full`, (B, ...)."
-        )
+        raise _no_single_value(f"Tensor.{name}")
     if name == "requires_grad_":
         full[0].requires_grad_(*args[1:], **kwargs)
         return leaves[at[0]]
@@ -401,6 +400,10 @@ def _asks_structure(func: Any) -> bool:
 
 def _below(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
     """One operation that no Python function of torch has seen (`torch.as_tensor`): `vmap` has no say."""
+    resolve: Resolve | None = getattr(_active, "resolve", None)
+    if resolve is not None:
+        args, kwargs = tree_map(lambda x: resolve(x) if isinstance(x, RowNumbers) else x, (args, kwargs))
+        return func(*args, **kwargs)
     if func._schema.name in _ENTRYWISE:
         return RowNumbers(func(args[0].full, *args[1:], **kwargs))
     leaves, spec = tree_flatten((args, kwargs))
@@ -412,7 +415,16 @@ def _below(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         each.append(func(*positional, **named))
     if isinstance(each[0], Tensor):
         return RowNumbers(torch.stack(each))
+    if any(one != each[0] for one in each):
+        raise _no_single_value(func._schema.name)
     return each[0]
+
+
+def _no_single_value(name: str) -> ValueError:
+    return ValueError(
+        f"`{name}` of `rows(...)`: a number that differs from row to row has no single value; "
+        "compute with it in torch, or read `.full`, (B, ...)."
+    )
 
 
 def _other_count(column: Tensor, count: int) -> ValueError:

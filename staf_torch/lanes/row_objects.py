@@ -298,7 +298,12 @@ class _Merge:
         if hasattr(first, "__dict__") and not isinstance(first, type):
             made: Any = object.__new__(kind)
             self._made[key] = made
-            vars(made).update(self._dict([vars(value) for value in values], name))
+            held = [dict(vars(value)) for value in values]
+            for key in getattr(kind, "none_is_zero", ()):
+                there = next((each[key] for each in held if each[key] is not None), None)
+                for each in held if there is not None else ():
+                    each[key] = torch.zeros_like(there) if each[key] is None else each[key]
+            vars(made).update(self._dict(held, name))
             return made
         if all(value == first for value in values):
             return first

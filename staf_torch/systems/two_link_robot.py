@@ -46,12 +46,12 @@ class TwoLinkRobot(ControlAffineSystem):
         friction: Sequence[float] = (5.3, 1.1, 8.45, 2.35),
     ) -> None:
         super().__init__()
-        p1, p2, p3 = vector("TwoLinkRobot", "inertia", list(inertia), 3)
+        p1, p2, p3 = vector("TwoLinkRobot", "inertia", inertia, 3)
         positive_real("TwoLinkRobot", "inertia", p2)
         # det M = p1 p2 - p2^2 - p3^2 cos^2 q2, least at q2 = 0.
         positive_real("TwoLinkRobot", "inertia", p2 * (p1 - p2) - p3 * p3)
         self.inertia = hold(self, "inertia", torch.tensor([p1, p2, p3], dtype=torch.float64, device="cpu"))
-        given = vector("TwoLinkRobot", "friction", list(friction), 4)
+        given = vector("TwoLinkRobot", "friction", friction, 4)
         self.friction = hold(self, "friction", torch.tensor(given, dtype=torch.float64, device="cpu"))
 
     def drift(self, x: Tensor) -> Tensor:

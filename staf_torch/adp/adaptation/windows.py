@@ -73,8 +73,8 @@ class Windows(metaclass=OfRows):
             x.new_zeros(*lead, count, self.model.parameters_count),
             x.new_zeros(*lead, count),
             x.new_full(lead, -1.0),
-            x.new_full(lead, self.first) if length is None else length.to(x),
-            x.new_full(lead, self.length) if length is None else length.to(x),
+            x.new_zeros(lead) + self.first if length is None else length.to(x),
+            x.new_zeros(lead) + self.length if length is None else length.to(x),
             torch.zeros_like(x),
             x.new_zeros(lead),
         )

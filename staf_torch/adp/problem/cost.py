@@ -78,6 +78,8 @@ class Cost(nn.Module, metaclass=OfRows):
         "policy": (2, 1),
     }
 
+    none_is_zero = ("target", "target_input")  # where other rows have one
+
     @beside
     def __init__(
         self,

@@ -7,6 +7,7 @@ library's (`factorisations`, `eigenvalues`, `decompositions`), else torch's own 
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -201,19 +202,29 @@ class _TorchFunctions(TorchFunctionMode):
                 chosen = wrapped or self._traced(args[0])
             if chosen:
                 return plain(*args, **kwargs)
-        if name in _LEAVES_TORCH and not (name in _MAKES and isinstance(args[0], Tensor)):
-            for tensor in tensors(args[:1]):
-                if self._traced(tensor) and name not in _MAKES:
-                    raise NotLoweredError(f"`Tensor.{name}` takes numbers of a row out of torch", name)
-                if not self._traced(tensor):
-                    self._captured.taken(tensor)
+        if name in _MAKES and args and isinstance(args[0], list | tuple) and tensors(args[0]):
+            return func(_stacked(args[0]), *args[1:], **kwargs)
+        if name in _LEAVES_TORCH:
+            if self._traced(args[0]):
+                raise NotLoweredError(f"`Tensor.{name}` takes numbers of a row out of torch", name)
+            self._captured.taken(args[0])
         if name == "__bool__" and args[0].is_floating_point():  # other numbers may be as true as this
             return bool(args[0] != 0)
         return func(*args, **kwargs)
 
 
+def _stacked(parts: Any) -> Tensor:
+    """Return nested lists of numbers and tensors as a tensor, of which operations are seen."""
+    if not isinstance(parts, list | tuple):
+        return parts if isinstance(parts, Tensor) else torch.as_tensor(parts, device="cpu")
+    found = [_stacked(part) for part in parts]
+    real = functools.reduce(torch.promote_types, (part.dtype for part in found))
+    device = next((part.device for part in found if part.device.type != "cpu"), None)
+    return torch.stack([part.to(device or part.device, real) for part in found])
+
+
 _MAKES = ("tensor", "as_tensor", "asarray")  # of numbers, also those of tensors in lists
-_LEAVES_TORCH = ("numpy", "__array__", "tolist", "__dlpack__", "__repr__", *_MAKES)
+_LEAVES_TORCH = ("numpy", "__array__", "tolist", "__dlpack__", "__repr__")
 _PLAIN: dict[Any, Callable[..., Any]] = {
     torch.linalg.eigvalsh: eigenvalues.eigenvalues,
     torch.nn.functional.one_hot: _one_hot,

@@ -1,0 +1,356 @@
+"""Everything with numbers, and between which numbers they may differ from row to row."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+from helpers_adaptation import COST as PENDULUM_COST
+from helpers_adaptation import PENDULUM as PARAMETRIC
+from torch import Tensor
+
+import staf_torch as st
+from staf_torch import adp, optim, predictors, systems, targets
+
+Run = Callable[[slice, torch.dtype], Any]
+"""Of some rows, in a dtype: tensors of theirs."""
+Ends = tuple[Any, Any]
+"""Numbers, or lists of them, between which the numbers of the rows are spread."""
+
+
+class Case(NamedTuple):
+    numbers: dict[str, Ends]
+    run: Callable[..., Run]  # from these numbers
+    tolerance: float = 0.0  # in plain torch, as sums have another order there
+
+
+ROWS = 7
+X0 = torch.tensor([[-1.0, 1.0], [0.5, 0.5], [0.2, -0.7], [0.1, 0.3], [0.6, -0.2], [-0.4, 0.3], [0.9, 0.1]])
+STATES = torch.stack([X0 + 0.02 * k * X0.flip(1) for k in range(4)], dim=1)  # (B, T, n)
+TWO, COST, PENDULUM = systems.TwoState(), adp.QuadraticCost(1.0, 1.0, 2, 1), systems.Pendulum()
+LQR, PENDULUM_LQR = adp.LQR(TWO, COST), adp.LQR(PENDULUM, COST)
+RINGS = st.rings(3)
+WINDOWS = adp.IntegralWindows(PARAMETRIC, 0.04)
+LAW = adp.LeastSquares([0.1, 1.0], 0.5)
+
+
+def chase(
+    kernel: Any = None,
+    radius: Any = 0.3,
+    directions: Any = RINGS,
+    law: Any = None,
+    target: Any = None,
+    by: Any = None,
+) -> Run:
+    centers = st.StateFollowingCenters(directions, radius)
+    basis = st.StaFBasis(st.GaussianKernel(0.7) if kernel is None else kernel, centers)
+    law, target = law or optim.SteepestDescent(), target or targets.Paper()
+    return lambda rows, real: (
+        st.chase_weights(STATES[rows].to(real), basis, target, law, predictor=by).weights
+    )
+
+
+def trajectory(plant: systems.ControlAffineSystem) -> Run:
+    x0 = torch.linspace(-0.3, 0.4, ROWS * (plant.dim or 2)).reshape(ROWS, -1)
+    return lambda rows, real: systems.simulate(plant, x0[rows].to(real), dt=0.01, steps=3)
+
+
+def loop(
+    controller: Any = LQR,
+    plant: systems.Plant = TWO,
+    cost: adp.Cost = COST,
+    dt: float = 0.02,
+    **settings: Any,
+) -> Run:
+    def run(rows: slice, real: torch.dtype) -> Any:
+        seeds = [*range(ROWS)][rows]
+        found = adp.simulate(
+            controller, plant, cost, X0[rows].to(real), dt=dt, steps=3, seed=seeds, substeps=1, **settings
+        )
+        return found.state, found.cost, found.recorded
+
+    return run
+
+
+def learner(basis: Any = None, law: Any = None, points: Any = None, **settings: Any) -> Run:
+    basis = adp.QuadraticBasis(2) if basis is None else basis
+    points = adp.QuadraturePoints(2, 2, 0.5) if points is None else points
+    return loop(adp.ActorCritic(basis, TWO, COST, points, law, **settings))
+
+
+def staf(
+    kernel: Any = None, radius: Any = 0.3, gradient: str = "total", directions: Any = RINGS
+) -> adp.ValueBasis:
+    kernel = st.AnchoredKernel(st.ExponentialKernel()) if kernel is None else kernel
+    return adp.StaFValueBasis(st.StaFBasis(kernel, st.StateFollowingCenters(directions, radius)), gradient)
+
+
+def angle(x: Tensor) -> Tensor:
+    return x[..., :1]
+
+
+def observed(kind: Any, noise: Any = (0.01,), process: Any = 0.01, mass: Any = 1.0, **guess: Any) -> Run:
+    filter_ = kind(systems.Pendulum(mass), angle, noise=noise, process=process)
+    inside = adp.Observed(adp.Feedback(PENDULUM_LQR), filter_, **{"deviation": 0.5, **guess})
+    return loop(adp.Measured(inside, noise=0.01, dim=1, output=angle), PENDULUM)
+
+
+def identified(windows: Any = WINDOWS, law: Any = LAW, **settings: Any) -> Run:
+    control = adp.AdaptiveLQR(PARAMETRIC, PENDULUM_COST, windows, law, doublings=3, **settings)
+    return loop(control, PARAMETRIC, PENDULUM_COST)
+
+
+def drift(**settings: Any) -> Run:
+    known = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
+    stated = {"deviation": 2.0, "length": 0.04, "floor": 1e-3, **settings}
+    centers = 0.5 * torch.tensor([[1.0, 0.0], [-0.5, 0.9], [-0.5, -0.9]]).double()
+    found = adp.StreamDrift(known, st.GaussianKernel(stated.pop("width", 2.0)), centers, rows=[1], **stated)
+    return loop(adp.DriftLQR(found, PENDULUM_COST, doublings=3), PENDULUM, PENDULUM_COST)
+
+
+class Gained(adp.Controller):
+    """A user's controller, whose number is an attribute."""
+
+    def __init__(self, gain: Any) -> None:
+        super().__init__()
+        self.gain = gain
+
+    def init(self, x0: Tensor) -> Tensor:
+        return self.gain * x0[:, 0]
+
+    def step(self, x: Tensor, carried: Tensor, uniform: Tensor, dt: float) -> tuple[Tensor, Tensor]:
+        carried = carried + dt * x[:, 0]
+        return -(self.gain * (x.sum(-1) + carried)).unsqueeze(-1), carried
+
+
+GAINS = {
+    **{
+        "critic": (0.001, 0.01),
+        "critic_extrapolated": (0.2, 0.3),
+        "actor": (1.0, 1.4),
+        "forgetting": (0.003, 0.03),
+    },
+    **{"actor_decay": (0.01, 0.02), "normalisation": (0.05, 0.1), "information": (0.9, 1.0)},
+}
+EYE = torch.eye(2).tolist()
+TWICE = (2 * torch.eye(2)).tolist()
+WIDER = st.rings(3) * 0.8
+CASES: dict[str, Case] = {
+    # plants
+    "pendulum": Case(
+        {"mass": (0.5, 2.0), "length": (0.5, 1.5), "damping": (0.0, 0.3), "gravity": (9.0, 10.0)},
+        lambda **n: trajectory(systems.Pendulum(**n)),
+    ),
+    "cart_pole": Case(
+        {"cart": (0.5, 2.0), "pole": (0.1, 0.3), "half_length": (0.4, 0.6)},
+        lambda **n: trajectory(systems.CartPole(**n)),
+    ),
+    "planar_quadrotor": Case(
+        {"mass": (0.5, 2.0), "inertia": (0.1, 0.2)}, lambda **n: trajectory(systems.PlanarQuadrotor(**n))
+    ),
+    "van_der_pol": Case({"damping": (0.5, 2.0)}, lambda **n: trajectory(systems.VanDerPol(**n))),
+    "oscillator": Case({"frequency": (0.5, 2.0)}, lambda **n: trajectory(systems.Oscillator(**n)), 1e-15),
+    "linear": Case(
+        {"matrix": ([[-0.1, 1.0], [-1.0, -0.3]], [[-0.2, 1.5], [-1.0, -0.1]])},
+        lambda **n: trajectory(systems.Linear(**n)),
+        1e-15,
+    ),
+    "two_state_chain": Case(
+        {"theta": ([1.0, -1.0, -0.5, 0.5], [0.8, -1.0, -0.4, 0.6])},
+        lambda **n: trajectory(systems.TwoStateChain(**n)),
+    ),
+    "two_link_robot": Case(
+        {
+            "friction": ([5.3, 1.1, 8.45, 2.35], [5.0, 1.0, 8.0, 2.0]),
+            "inertia": ([3.473, 0.196, 0.242], [3.5, 0.2, 0.2]),
+        },
+        lambda **n: trajectory(systems.TwoLinkRobot(**n)),
+    ),
+    "barrier": Case(
+        {"low": ([-7.0, -6.0], [-6.0, -7.0]), "high": ([5.0, 7.0], [6.0, 7.0])},
+        lambda **n: trajectory(systems.Barrier(systems.TwoStateChain(), **n)),
+    ),
+    # costs
+    "quadratic_cost": Case(
+        {
+            "state": (1.0, 2.0),
+            "control": (0.5, 1.0),
+            "low": (-0.5, -1.0),
+            "high": (0.5, 1.0),
+            "discount": (0.1, 1.0),
+        },
+        lambda **n: loop(cost=adp.QuadraticCost(dim=2, inputs=1, **{"state": 1.0, "control": 1.0, **n})),
+    ),
+    "matrices of a cost": Case(
+        {"state": (EYE, TWICE), "terminal": (EYE, TWICE), "control": ([[1.0]], [[2.0]])},
+        lambda **n: loop(cost=adp.QuadraticCost(dim=2, inputs=1, **{"state": 1.0, "control": 1.0, **n})),
+    ),
+    "set-points": Case(
+        {"target": ([0.0, 0.0], [0.3, 0.0])},
+        lambda target: loop(cost=adp.QuadraticCost(1.0, 1.0, 2, 1, target=target), plant=PENDULUM),
+    ),
+    "bounded_input_cost": Case(
+        {"bound": (1.0, 8.0), "control": (0.1, 0.2)},
+        lambda **n: loop(
+            cost=adp.BoundedInputCost(1.0, dim=2, inputs=1, **{"bound": 8.0, "control": 0.1, **n})
+        ),
+    ),
+    "avoidance_cost": Case(
+        {"reach": (0.4, 0.6), "weight": (1.0, 2.0)},
+        lambda **n: loop(
+            cost=adp.AvoidanceCost(
+                *(1.0, 1.0, 2, 1), obstacles=lambda x: x[..., 0].square() - 0.1, **{"reach": 0.5, **n}
+            )
+        ),
+    ),
+    "lqr": Case(
+        {"q": (1.0, 2.0), "discount": (0.1, 1.0)},
+        lambda q=1.0, discount=0.0: loop(adp.LQR(TWO, adp.QuadraticCost(q, 1.0, 2, 1, discount=discount))),
+    ),
+    "supervised": Case(
+        {"trust": (0.3, 0.6)},
+        lambda trust: loop(adp.Supervised(adp.Feedback(lambda x: 10 * x[..., 1:]), LQR, COST, trust)),
+    ),
+    "user's controller": Case({"gain": (0.5, 1.0)}, lambda gain: loop(Gained(gain))),
+    # kernels, radii, directions, targets, laws, predictors
+    "gaussian": Case(
+        {"width": (0.5, 1.5)}, lambda width: chase(st.GaussianKernel(width), by=predictors.Tangent()), 1e-9
+    ),
+    "anchored_gaussian": Case(
+        {"width": (0.5, 1.5)}, lambda width: chase(st.AnchoredKernel(st.GaussianKernel(width))), 1e-9
+    ),
+    "matern": Case(
+        {"length_scale": (0.8, 1.5)}, lambda length_scale: chase(st.MaternKernel(2.5, length_scale)), 1e-9
+    ),
+    "inverse_multiquadric": Case(
+        {"c": (0.5, 1.0)}, lambda c: chase(st.InverseMultiquadricKernel(c), by=predictors.Secant(True)), 1e-9
+    ),
+    "rational_quadratic": Case(
+        {"alpha": (1.0, 2.0), "length_scale": (0.5, 1.0)},
+        lambda alpha=1.7, length_scale=0.9: chase(st.RationalQuadraticKernel(alpha, length_scale)),
+        1e-9,
+    ),
+    "polynomial": Case({"bias": (0.5, 1.0)}, lambda bias: chase(st.PolynomialKernel(3, bias)), 1e-9),
+    "constant_radius": Case({"radius": (0.1, 0.4)}, lambda radius: chase(radius=radius), 1e-9),
+    "state_radius": Case(
+        {"radius": (0.3, 0.7), "offset": (0.01, 0.05), "gain": (1.0, 2.0)},
+        lambda radius=0.3, offset=0.05, gain=1.0: chase(radius=st.StateRadius(radius, offset, gain)),
+        1e-9,
+    ),
+    "directions": Case(
+        {"directions": (RINGS.tolist(), WIDER.tolist())},
+        lambda directions: chase(directions=torch.as_tensor(directions, dtype=torch.float64)),
+        1e-9,
+    ),
+    "quadratic_target": Case({"matrix": (1.0, 2.0)}, lambda matrix: chase(target=targets.Quadratic(matrix))),
+    "matrix of a target": Case(
+        {"matrix": (EYE, TWICE)}, lambda matrix: chase(target=targets.Quadratic(matrix))
+    ),
+    "cosine": Case(
+        {"frequency": ([1.0, 2.0], [2.0, 1.0]), "phase": (0.0, 1.0)},
+        lambda **n: chase(target=targets.Cosine(**n)),
+    ),
+    "fixed_step": Case({"step": (0.2, 0.9)}, lambda step: chase(law=optim.FixedStep(step))),
+    "absolute_step": Case(
+        {"step": (0.02, 0.1)}, lambda step: chase(law=optim.FixedStep(step, relative=False))
+    ),
+    "heavy_ball": Case(
+        {"step": (0.5, 1.0), "momentum": (0.5, 0.9)},
+        lambda step=1.0, momentum=0.9: chase(law=optim.HeavyBall(step, momentum)),
+    ),
+    "nesterov": Case(
+        {"step": (0.5, 0.9), "momentum": (0.5, 0.9)}, lambda **n: chase(law=optim.Nesterov(**n))
+    ),
+    "normalised_lms": Case({"step": (0.5, 0.9)}, lambda step: chase(law=optim.NormalisedLMS(step))),
+    "recursive_least_squares": Case(
+        {"process_noise": (0.0, 1.0), "measurement_noise": (1e-3, 1e-2), "prior": (1e3, 1e4)},
+        lambda **n: chase(law=optim.RecursiveLeastSquares(**n)),
+    ),
+    # what learns while it controls
+    "information": Case(
+        {**GAINS, "bound": (5.0, 10.0)},
+        lambda bound=None, **n: learner(law=adp.Information(adp.Gains(**n), bound)),
+    ),
+    "published": Case(
+        {**GAINS, "bound": (5.0, 10.0)},
+        lambda bound=None, **n: learner(law=adp.Published(adp.Gains(**n), bound)),
+        1e-14,
+    ),
+    "policy_iteration": Case(
+        {"damping": (1e-3, 1e-2), "settling": (0.01, 0.02)}, lambda **n: learner(law=adp.PolicyIteration(**n))
+    ),
+    "first weights": Case(
+        {"critic": ([0.3] * 3, [0.5] * 3), "actor": (0.2, 0.4), "gain": (200.0, 300.0)},
+        lambda **n: learner(law=adp.Frozen(), **n),
+    ),
+    "random_points": Case(
+        {"half_width": (0.3, 0.5)}, lambda half_width: learner(points=adp.RandomPoints(2, half_width))
+    ),
+    "quadrature_points": Case(
+        {"half_width": (0.3, 0.5)},
+        lambda half_width: learner(points=adp.QuadraturePoints(2, 2, half_width, "fixed", around="origin")),
+    ),
+    "rbf_grid": Case(
+        {"half_width": (1.0, 2.0), "width": (0.5, 1.0)}, lambda **n: learner(adp.RBFGridBasis(2, 2, **n))
+    ),
+    "staf_value_basis": Case(
+        {"radius": (0.2, 0.4), "directions": (RINGS.tolist(), WIDER.tolist())},
+        lambda radius=0.3, directions=RINGS: learner(
+            staf(radius=radius, directions=torch.as_tensor(directions, dtype=torch.float64))
+        ),
+    ),
+    "gaussian value basis": Case(
+        {"width": (0.5, 0.7)},
+        lambda width: learner(staf(st.AnchoredKernel(st.GaussianKernel(width)), gradient="partial")),
+    ),
+    # estimation, adaptation
+    "measured": Case(
+        {"noise": ([0.0, 0.1], [0.1, 0.2])},
+        lambda noise: loop(adp.Measured(adp.Feedback(LQR), noise=noise, dim=2)),
+    ),
+    "extended_kalman": Case(
+        {"noise": ([0.01], [0.1]), "process": (0.01, 0.1), "deviation": (0.1, 1.0), "mass": (0.8, 1.2)},
+        lambda **n: observed(adp.ExtendedKalman, **n),
+        1e-14,
+    ),
+    "unscented_kalman": Case(
+        {"noise": ([0.01], [0.1]), "process": ([0.01, 0.0], [0.1, 0.1]), "mean": ([0.0, 0.0], [0.1, 0.1])},
+        lambda **n: observed(adp.UnscentedKalman, **n),
+        1e-14,
+    ),
+    "least_squares": Case(
+        {
+            "theta": ([0.1, 1.0], [0.2, 0.8]),
+            "deviation": (0.3, 0.5),
+            "floor": (1e-6, 1e-5),
+            "forgetting": (0.1, 0.2),
+            "alarm": (3.0, 5.0),
+        },
+        lambda **n: identified(law=adp.LeastSquares(**{"theta": [0.1, 1.0], "deviation": 0.5, **n})),
+        1e-14,
+    ),
+    "windows": Case(
+        {"length": (0.03, 0.04), "noise": (0.0, 0.01)},
+        lambda **n: identified(adp.IntegralWindows(PARAMETRIC, **{"length": 0.04, **n})),
+        1e-14,
+    ),
+    "adaptive_lqr": Case({"confidence": (2.0, 3.0), "probe": (0.1, 0.2)}, lambda **n: identified(**n), 1e-14),
+    "consider_filter": Case(
+        {"noise": (0.01, 0.02), "process": ([0.0, 0.1], [0.1, 0.2])},
+        lambda **n: identified(filter=adp.ConsiderFilter(PARAMETRIC, **{"noise": 0.01, **n})),
+        1e-14,
+    ),
+    "stream_drift": Case(
+        {
+            "deviation": (1.0, 2.0),
+            "length": (0.03, 0.04),
+            "noise": (0.0, 0.01),
+            "floor": (1e-3, 1e-2),
+            "forgetting": (0.1, 0.2),
+            "width": (1.5, 2.0),
+        },
+        lambda **n: drift(**n),
+        1e-9,
+    ),
+}
