@@ -4,34 +4,27 @@ from __future__ import annotations
 
 import copy
 import pickle
-from collections.abc import Callable
+import random
 from typing import Any
 
 import pytest
 import torch
+from helpers_rows import CASES, ROWS
 from torch import Tensor, nn
+from variants import by_turns
 
 import staf_torch as st
-from staf_torch import adp, lanes, optim, systems, targets
+from staf_torch import adp, lanes, optim, systems
+from staf_torch.lanes.tree import flatten
 
-ROWS = 3
-Make = Callable[..., Any]
-
-
-def spread(low: float, high: float, rows: int = ROWS) -> Tensor:
-    return torch.linspace(low, high, rows, dtype=torch.float64)
+FEW = 3
 
 
-PLANTS: dict[str, tuple[Make, dict[str, tuple[float, float]]]] = {
-    "pendulum": (
-        systems.Pendulum,
-        {"mass": (0.5, 2.0), "length": (0.5, 1.5), "damping": (0.0, 0.3), "gravity": (9.0, 10.0)},
-    ),
-    "cart_pole": (systems.CartPole, {"cart": (0.5, 2.0), "pole": (0.1, 0.3), "half_length": (0.4, 0.6)}),
-    "planar_quadrotor": (systems.PlanarQuadrotor, {"mass": (0.5, 2.0), "inertia": (0.1, 0.2)}),
-    "van_der_pol": (systems.VanDerPol, {"damping": (0.5, 2.0)}),
-    "oscillator": (systems.Oscillator, {"frequency": (0.5, 2.0)}),
-}
+def spread(low: Any, high: Any, rows: int = FEW) -> Tensor:
+    """Numbers (B, ...) from ``low`` to ``high``."""
+    first, last = (torch.tensor(end, dtype=torch.float64) for end in (low, high))
+    share = torch.linspace(0.0, 1.0, rows, dtype=torch.float64).reshape(-1, *[1] * first.dim())
+    return first + share * (last - first)
 
 
 class Spring(systems.ControlAffineSystem):
@@ -56,20 +49,41 @@ def either(request: pytest.FixtureRequest) -> Any:
         yield request.param
 
 
-@pytest.mark.parametrize("name", PLANTS)
-def test_plants_of_rows_are_the_loop_of_single_ones(name: str, either: str) -> None:
-    kind, numbers = PLANTS[name]
-    many = kind(**{key: st.rows(spread(*ends)) for key, ends in numbers.items()})
-    x0 = 0.3 * torch.randn(ROWS, many.dim, dtype=torch.float64)
-    states = systems.simulate(many, x0, dt=0.01, steps=20)
-    for row in range(ROWS):
-        one = kind(**{key: float(spread(*ends)[row]) for key, ends in numbers.items()})
-        alone = systems.simulate(one, x0[row : row + 1], dt=0.01, steps=20)[0]
-        assert torch.equal(states[row], alone)
+@pytest.mark.parametrize(("name", "rows"), by_turns(CASES, (2, ROWS, 1, 2)))
+def test_everything_with_numbers_of_rows_is_the_loop_of_single_ones(name: str, rows: int) -> None:
+    case, real = CASES[name], torch.float32 if rows == ROWS else torch.float64
+    names, draw = [*case.numbers], random.Random(name)
+    own = draw.sample(names, draw.randint(1, len(names)))  # the others are one number for all rows
+    numbers = {key: spread(*case.numbers[key], rows) for key in names}
+    told = {key: st.rows(value) if key in own else value[0].tolist() for key, value in numbers.items()}
+    with lanes.compiling("never"):
+        many = flatten(case.run(**told)(slice(0, rows), real))[0]
+        for row in {0, rows - 1}:
+            single = {key: value[row if key in own else 0].tolist() for key, value in numbers.items()}
+            alone = flatten(case.run(**single)(slice(row, row + 1), real))[0]
+            scale = 1e7 if real == torch.float32 else 1
+            for found, wanted in zip(many, alone, strict=True):
+                close = case.tolerance * (scale if case.tolerance else 1)
+                torch.testing.assert_close(found[row], wanted[0], rtol=close, atol=close, equal_nan=True)
+
+
+@pytest.mark.parametrize("name", ["pendulum", "quadratic_cost", "state_radius", "information"])
+def test_numbers_of_rows_are_columns_of_compiled_code_in_which_a_row_has_the_bits_that_it_has_alone(
+    name: str,
+) -> None:
+    case = CASES[name]
+    numbers = {key: spread(*ends, ROWS) for key, ends in case.numbers.items()}
+    with lanes.compiling("always"):
+        run = case.run(**{key: st.rows(value) for key, value in numbers.items()})
+        many = flatten(run(slice(0, ROWS), torch.float64))[0]
+        single = case.run(**{key: st.rows(value[4:5]) for key, value in numbers.items()})
+        alone = flatten(single(slice(4, 5), torch.float64))[0]
+    for found, wanted in zip(many, alone, strict=True):
+        torch.testing.assert_close(found[4], wanted[0], rtol=0, atol=0, equal_nan=True)
 
 
 def test_a_users_plant_and_cost_run_in_a_closed_loop_under_a_policy_for_all_and_one_each(either: str) -> None:
-    stiff, q, x0 = spread(0.5, 4.0), spread(1.0, 3.0), torch.tensor([[1.0, 0.0]]).double().expand(ROWS, 2)
+    stiff, q, x0 = spread(0.5, 4.0), spread(1.0, 3.0), torch.tensor([[1.0, 0.0]]).double().expand(FEW, 2)
     plant, cost = Spring(st.rows(stiff)), adp.QuadraticCost(st.rows(q), 1.0, 2, 1, low=-2.0, high=2.0)
     nominal = adp.LQR(Spring(torch.tensor(1.0)), adp.QuadraticCost(1.0, 1.0, 2, 1))
     own = adp.LQR(plant, cost)
@@ -77,7 +91,7 @@ def test_a_users_plant_and_cost_run_in_a_closed_loop_under_a_policy_for_all_and_
         (Spring(k), adp.QuadraticCost(float(w), 1.0, 2, 1, low=-2.0, high=2.0))
         for k, w in zip(stiff, q, strict=True)
     ]
-    for policies in ([nominal] * ROWS, [adp.LQR(*each) for each in one]):
+    for policies in ([nominal] * FEW, [adp.LQR(*each) for each in one]):
         shared = policies[0] is nominal
         run = adp.simulate(nominal if shared else own, plant, cost, x0, dt=0.02, steps=20)
         for row, (policy, each) in enumerate(zip(policies, one, strict=True)):
@@ -90,14 +104,14 @@ def test_a_users_plant_and_cost_run_in_a_closed_loop_under_a_policy_for_all_and_
 def test_scenes_with_discs_of_their_own_stand_behind_one_filter() -> None:
     plant = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
     cost, walls = adp.QuadraticCost(1.0, 1.0, 2, 1), spread(-0.3, 0.1)
-    lqr, x0 = adp.LQR(plant, cost), torch.tensor([[1.0, -1.0]]).double().expand(ROWS, 2)
+    lqr, x0 = adp.LQR(plant, cost), torch.tensor([[1.0, -1.0]]).double().expand(FEW, 2)
 
     def safe(wall: Tensor) -> adp.SafetyFilter:
         return adp.SafetyFilter(lqr, plant, lambda x, t: x[:, 0] - wall, dt=0.05, low=-3.0, high=3.0)
 
     with lanes.compiling("always"):
         run = adp.simulate(safe(st.rows(walls)), plant, cost, x0, steps=30)
-        for row in range(ROWS):
+        for row in range(FEW):
             alone = adp.simulate(safe(walls[row]), plant, cost, x0[:1], steps=30)
             assert torch.equal(run.state[row], alone.state[0])
 
@@ -148,8 +162,8 @@ def test_modules_of_one_class_become_one_with_the_numbers_of_all() -> None:
 
 
 def test_a_batch_of_another_size_is_refused_with_both_numbers() -> None:
-    plant, cost = systems.Pendulum(mass=st.rows(torch.ones(ROWS).double())), adp.QuadraticCost(1.0, 1.0, 2, 1)
-    x0, policy = torch.rand(ROWS + 1, 2).double(), adp.LQR(systems.Pendulum(), cost)
+    plant, cost = systems.Pendulum(mass=st.rows(torch.ones(FEW).double())), adp.QuadraticCost(1.0, 1.0, 2, 1)
+    x0, policy = torch.rand(FEW + 1, 2).double(), adp.LQR(systems.Pendulum(), cost)
     for run in (
         lambda: systems.simulate(plant, x0, dt=0.01, steps=3),
         lambda: adp.simulate(policy, plant, cost, x0, dt=0.01, steps=3),
@@ -163,10 +177,10 @@ def test_a_batch_of_another_size_is_refused_with_both_numbers() -> None:
 
 @pytest.mark.parametrize("count", [1, 3])
 def test_centers_and_a_basis_called_directly_take_rows(count: int) -> None:
-    radii, x = spread(0.1, 0.3), torch.randn(ROWS, 2).double()
+    radii, x = spread(0.1, 0.3), torch.randn(FEW, 2).double()
     layout = st.rings(3) if count == 3 else st.polygon(1)
     many = st.StateFollowingCenters(layout, st.rows(radii))
-    for row in range(ROWS):
+    for row in range(FEW):
         one = st.StateFollowingCenters(layout, radii[row])
         torch.testing.assert_close(many(x)[row], one(x[row]), rtol=1e-15, atol=0)
         torch.testing.assert_close(many.offsets(x)[row], one.offsets(x[row]), rtol=1e-15, atol=0)
@@ -203,7 +217,7 @@ def test_a_rule_names_the_first_row_that_breaks_it() -> None:
 
 def test_numbers_of_rows_survive_copies_casts_and_pickles() -> None:
     plant = Spring(st.rows(spread(0.5, 4.0)))
-    x = torch.randn(ROWS, 2).double()
+    x = torch.randn(FEW, 2).double()
     for other in (copy.deepcopy(plant), pickle.loads(pickle.dumps(plant)), plant.float().double()):
         torch.testing.assert_close(other.drift(x), plant.drift(x), rtol=1e-6, atol=1e-6)
     assert "rows(" in repr(systems.Pendulum(mass=st.rows(spread(1.0, 2.0)))) + repr(
