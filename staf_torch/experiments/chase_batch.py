@@ -2,24 +2,36 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import logging
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..approximation.basis import REACH
+from ..approximation.basis import REACH, StaFBasis, Target
 from ..engine import ChaseResult, chase_pieces, chunk_length
+from ..engine.predictors import Predictor
+from ..lanes.contents import Contents
+from ..lanes.row_numbers import over_rows, some_rows
+from ..lanes.row_objects import merged
 from ..metrics.ball_error import StateErrorPass
 from ..metrics.chase import ChaseMetrics, Member
+from ..optim import UpdateLaw
 from ..results.files import grouped
 from ..settings.chase import ChaseProblem, warnings_to
-from ..systems import trajectory
+from ..systems import ControlAffineSystem, trajectory
 
-Sink = Callable[[Mapping[str, np.ndarray], int], None]
-"""Takes the next piece of time of a block of a problem's rows, name -> (b, C, ...), and its first row."""
+Sink = Callable[[Mapping[str, np.ndarray], int, int], None]
+"""Takes a piece of a problem's history, name -> (b, C, ...), with its first row and its first time."""
+
+_log = logging.getLogger(__name__)
+_REFUSALS = (ValueError, TypeError, NotImplementedError, RuntimeError)
+"""What objects raise that do not serve numbers of a row's own."""
 
 HISTORY = ("state", "value", "estimate", "weights", "ideal_weights", "excess")
 _DRAWN = (*HISTORY, "ideal_estimate")
@@ -45,11 +57,11 @@ def simulate(
     advance: Callable[[int], None] | None = None,
     errors: StateErrorPass | None = None,
 ) -> list[Outcome]:
-    """Run problems in pieces of time; those that share basis, target, law and dt run as one batch.
+    """Run problems in pieces of time; those that differ in numbers run as one batch.
 
-    Sharing means one object: `Parts` makes equal settings one. Different hyperparameters never meet in a
-    tensor. One batch over 5 radii x 5 seeds, or over 3 radii x 40 seeds, took as long as a batch a radius
-    (.95 and 1.12 times its CPU seconds); over 30 radii with steepest descent .48 to .56 times.
+    What differs between problems, a radius, a width, a gain, a mass, is then a column with a number a row.
+    Objects that differ in more, or with which a row's own numbers are not served, run one after the other.
+    No problem sees another.
 
     Args:
         problems: with the same number of steps and centers, the same iterations, predictor and certificate.
@@ -61,35 +73,103 @@ def simulate(
     Returns:
         In the order of the problems.
     """
+    found: dict[int, Outcome] = {}
+    alone = len(problems) == 1
+
+    def run(indices: Sequence[int], parts: _Objects, kinds: Sequence[int]) -> None:
+        members = [_BatchMember(problems[i], sinks[i], drawn[i]) for i in indices]
+        found.update(zip(indices, _run(members, parts, kinds, advance, errors, alone=alone), strict=True))
 
     def shared(i: int) -> tuple[object, ...]:
-        one = problems[i]
-        return (*map(id, (one.basis, one.target, one.law, *one.metrics)), one.dt)
+        return (problems[i].dt, *map(id, problems[i].metrics))
 
-    found: dict[int, Outcome] = {}
     for indices in grouped(range(len(problems)), shared).values():
-        members = [_BatchMember(problems[i], sinks[i], drawn[i]) for i in indices]
-        found |= zip(indices, _run(members, advance, errors, alone=len(problems) == 1), strict=True)
+        by_parts = grouped(indices, lambda i: _Identical(_parts(problems[i])))
+        for alike in _alike([key.parts for key in by_parts], own=bool(problems[indices[0]].metrics)):
+            each = [by_parts[_Identical(parts)] for parts in alike]
+            if len(alike) > 1:
+                try:
+                    kinds = [k for k, some in enumerate(each) for _ in some]
+                    run([i for some in each for i in some], merged(alike), kinds)
+                    continue
+                except _REFUSALS as error:
+                    _log.debug("%d problems run one after the other: %s", len(alike), error)
+            for parts, some in zip(alike, each, strict=True):
+                run(some, parts, [0] * len(some))
     return [found[i] for i in range(len(problems))]
+
+
+class _Objects(NamedTuple):
+    """Objects of a problem in which numbers may differ from row to row."""
+
+    system: ControlAffineSystem
+    basis: StaFBasis
+    target: Target
+    law: UpdateLaw
+    predictor: Predictor | None
+
+
+def _parts(problem: ChaseProblem) -> _Objects:
+    return _Objects(problem.system, problem.basis, problem.target, problem.law, problem.predictor)
+
+
+class _Identical:
+    """Key that is equal for the same objects: `settings.chase.Parts` makes equal settings one."""
+
+    def __init__(self, parts: _Objects) -> None:
+        self.parts, self._ids = parts, tuple(map(id, parts))
+
+    def __hash__(self) -> int:
+        return hash(self._ids)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Identical) and self._ids == other._ids
+
+
+def _alike(parts: Sequence[_Objects], *, own: bool) -> list[list[_Objects]]:
+    """Return the parts in sets whose members differ in numbers alone.
+
+    Args:
+        parts: of problems.
+        own: whether a metric of the user's own reads them, which sees one problem at a time.
+    """
+    if own:
+        return [[each] for each in parts]
+    if len(parts) == 1:
+        return [list(parts)]
+    keys = [Contents(0, *each).key for each in parts]
+    sets = grouped(range(len(parts)), lambda i: (i,) if keys[i] is None else keys[i])
+    return [[parts[i] for i in indices] for indices in sets.values()]
 
 
 def _run(
     members: Sequence[_BatchMember],
+    parts: _Objects,
+    kinds: Sequence[int],
     advance: Callable[[int], None] | None,
     errors: StateErrorPass | None,
     *,
     alone: bool,
 ) -> list[Outcome]:
-    """Run problems that differ in initial states and settle_time alone as one batch.
+    """Run problems of the same dt as one batch.
 
     Unless one problem is ``alone``, each member keeps the warnings about its own rows.
+
+    Args:
+        members: the problems.
+        parts: theirs, with numbers of rows where they differ.
+        kinds: of each member, the row of those numbers.
+        advance, errors: of `simulate`.
+        alone: whether there is no other problem.
     """
-    first = members[0].problem
+    first, basis = members[0].problem, parts.basis
     times, starts = first.steps + 1, torch.cat([member.problem.initial_states for member in members])
+    counts = torch.tensor([member.rows for member in members], dtype=torch.int64, device="cpu")
+    kind = torch.tensor(kinds, dtype=torch.int64, device="cpu").repeat_interleave(counts)  # (B,)
     metrics = ChaseMetrics(
-        first.basis,
-        first.target,
-        first.law,
+        basis,
+        parts.target,
+        parts.law,
         inner_steps=first.inner_steps,
         members=[Member(m.rows, m.problem.dt, m.problem.settle_time) for m in members],
         own=first.metrics,
@@ -98,48 +178,61 @@ def _run(
     tell = _of_whole_problems(advance, len(starts), len(members))
     together = _ROWS
     if any(member.sink is not None for member in members):
-        kept = starts.shape[1] + 3 + 2 * first.basis.count  # numbers of a row and time, of `HISTORY`
+        kept = starts.shape[1] + 3 + 2 * basis.count  # numbers of a row and time, of `HISTORY`
         whole = _BYTES // (times * kept * starts.element_size())  # rows with all times
         together = min(_ROWS, max(_FEW, whole))
     blocks = starts.split(together)
-    chunk = chunk_length(min(together, len(starts)), first.basis, starts.element_size())
+    chunk = chunk_length(min(together, len(starts)), basis, starts.element_size())
     # Some twenty pieces of a long run, so that progress is seen; the results do not depend on it.
     chunk = max(1, min(chunk, max(64, -(-times // 20))))
-    done, reach = 0, 0.0  # rows, and the largest |x| nu(x): blocks give one warning at the end
+    told = alone and len(blocks) == 1  # the engine warns of the reach, else each member of its own
+    done, reach = 0, torch.zeros(len(starts), dtype=starts.dtype, device=starts.device)  # largest |x| nu(x)
     with torch.no_grad(), warnings.catch_warnings():
-        if len(blocks) > 1 or not alone:
+        if not told:
             warnings.filterwarnings("ignore", message=REACH)
         for block in blocks:
+            rows, time = slice(done, done + len(block)), 0
             if done:
                 metrics.next_rows()
-            chased = chase_pieces(
-                trajectory(first.system, block, dt=first.dt, steps=first.steps, chunk=chunk),
-                first.basis,
-                first.target,
-                first.law,
-                inner_steps=first.inner_steps,
-                predictor=first.predictor,
-                certificate=first.certificate,
-            )
-            for result in chased:
-                metrics.add(result)
-                if len(blocks) > 1:
-                    reach = max(reach, first.basis.largest_reach(result.state))
-                _distribute(result, done, members, alone=alone)
-                tell(result.state.shape[0] * result.state.shape[1])
+            with some_rows(kind[rows]) if len(set(kinds)) > 1 else contextlib.nullcontext():
+                chased = chase_pieces(
+                    trajectory(parts.system, block, dt=first.dt, steps=first.steps, chunk=chunk),
+                    basis,
+                    parts.target,
+                    parts.law,
+                    inner_steps=first.inner_steps,
+                    predictor=parts.predictor,
+                    certificate=first.certificate,
+                )
+                for result in chased:
+                    metrics.add(result)
+                    if not told:
+                        reach[rows] = torch.maximum(reach[rows], _reach(basis, result.state))
+                    _distribute(result, done, time, members)
+                    time += result.state.shape[1]
+                    tell(result.state.shape[0] * result.state.shape[1])
             done += len(block)
-    if len(blocks) > 1 and alone:
-        first.basis.warn_reach(reach, stacklevel=2)
-    return [member.outcome(found) for member, found in zip(members, metrics.summaries(), strict=True)]
+    if alone and not told:
+        basis.warn_reach(float(reach.max()), stacklevel=2)
+    found = zip(members, metrics.summaries(), reach.split(counts.tolist()), strict=True)
+    return [member.outcome(summary, float(own.max()), alone=alone) for member, summary, own in found]
 
 
-def _distribute(result: ChaseResult, first: int, members: Sequence[_BatchMember], *, alone: bool) -> None:
+def _reach(basis: StaFBasis, states: Tensor) -> Tensor:
+    """Return the largest finite |x| nu(x) of each row of states (B, C, n); 0 for kernels that do not mind."""
+    if basis.kernel.log_gain(states[0, 0]) is None:
+        return states.new_zeros(len(states))
+    reach = over_rows(lambda at: at.norm(dim=-1) * basis.centers.radius(at), states)
+    return torch.where(torch.isfinite(reach), reach, 0.0).amax(1)
+
+
+def _distribute(result: ChaseResult, first: int, time: int, members: Sequence[_BatchMember]) -> None:
     """Give every member what a piece has of its rows; the piece begins at row ``first`` of the batch."""
     start, count = 0, result.state.shape[0]
     for member in members:
         low, high = max(start - first, 0), min(start + member.rows - first, count)
         if low < high:
-            member.take(result, slice(low, high), first + low - start, alone=alone)
+            member.take(result, slice(low, high), first + low - start, time)
         start += member.rows
 
 
@@ -167,26 +260,27 @@ class _BatchMember:
         self.problem, self.sink = problem, sink
         self.rows = len(problem.initial_states)
         self._thinned = _Thinned(problem.steps + 1) if drawn else None
-        self._warnings: list[str] = []
         self._diverged_at = torch.full((self.rows,), -1, dtype=torch.int64, device="cpu")
 
-    def take(self, result: ChaseResult, rows: slice, place: int, *, alone: bool) -> None:
+    def take(self, result: ChaseResult, rows: slice, place: int, time: int) -> None:
         """Take in ``rows`` of a piece of time, which are this problem's from ``place`` on."""
         if self._thinned is not None and place == 0:
             self._thinned.add(result, rows.start)
         if self.sink is not None:
-            self.sink({name: getattr(result, name)[rows].cpu().numpy() for name in HISTORY}, place)
+            history = {name: getattr(result, name)[rows].cpu().numpy() for name in HISTORY}
+            self.sink(history, place, time)
         self._diverged_at[place : place + rows.stop - rows.start] = result.diverged_at[rows].cpu()
-        if not alone and not self._warnings:
-            with warnings_to(self._warnings):
-                self.problem.basis.check_reach(result.state[rows])
 
-    def outcome(self, metrics: dict[str, float | None]) -> Outcome:
-        drawn = {}
+    def outcome(self, metrics: dict[str, float | None], reach: float, *, alone: bool) -> Outcome:
+        """Return the result; the largest |x| nu(x) of a problem that is not ``alone`` may be warned of."""
+        drawn, said = {}, list[str]()
         if self._thinned is not None:
             time = np.arange(self.problem.steps + 1) * self.problem.dt
             drawn = self._thinned.arrays() | {"time": time[:: self._thinned.stride]}
-        return Outcome(metrics, drawn, self._diverged_at, tuple(self._warnings))
+        if not alone:
+            with warnings_to(said):
+                self.problem.basis.warn_reach(reach)
+        return Outcome(metrics, drawn, self._diverged_at, tuple(said))
 
 
 class _Thinned:

@@ -79,7 +79,8 @@ class GradientChase(BatchedExperiment[ChaseSolution]):
     batchable = frozenset(
         {
             *("seed", "initial_state", "spread", "trajectories", "dt", "duration", "settle_time"),
-            *("centers.radius", "centers.shrink.*", "kernel.*", "target.*", "optimizer.*"),
+            *("centers.radius", "centers.directions", "centers.shrink.*"),
+            *("kernel.*", "target.*", "optimizer.*", "system.*", "predictor.*"),
         }
     )
 
@@ -94,7 +95,7 @@ class GradientChase(BatchedExperiment[ChaseSolution]):
         with contextlib.ExitStack() as stack:
             writer = stack.enter_context(out.history(title.rows, title.times)) if history else None
             advance = stack.enter_context(progress.over(title.times, "times"))
-            sink = None if writer is None else writer.add
+            sink = None if writer is None else lambda pieces, row, _: writer.add(pieces, row)
             (outcome,) = simulate([problem], [sink], [figures], advance)
             if writer is not None:
                 writer.close(time=_times(title))
@@ -183,18 +184,15 @@ class _Memory:
     """A history kept in memory."""
 
     def __init__(self, batch: int, times: int) -> None:
-        self._shape, self._row, self._done = (batch, times), 0, 0
+        self._shape = batch, times
         self.arrays: dict[str, np.ndarray] = {}
 
-    def add(self, pieces: Mapping[str, np.ndarray], row: int) -> None:
-        if row != self._row:
-            self._row, self._done = row, 0
-        start, (rows, length) = self._done, next(iter(pieces.values())).shape[:2]
+    def add(self, pieces: Mapping[str, np.ndarray], row: int, time: int) -> None:
         for name, piece in pieces.items():
             if name not in self.arrays:
                 self.arrays[name] = np.empty((*self._shape, *piece.shape[2:]), piece.dtype)
-            self.arrays[name][row : row + rows, start : start + length] = piece
-        self._done += length
+            rows, length = piece.shape[:2]
+            self.arrays[name][row : row + rows, time : time + length] = piece
 
 
 def _wanted(cfg: DictConfig | PlainSettings, problem: ChaseProblem) -> tuple[bool, bool]:

@@ -199,10 +199,13 @@ def resolving(resolve: Resolve | None) -> Iterator[None]:
 
 
 @contextmanager
-def some_rows(chosen: Tensor) -> Iterator[None]:
-    """Batches of the block hold these rows (R,) of those that numbers were given for, in this order."""
+def some_rows(chosen: Tensor | None) -> Iterator[None]:
+    """Batches of the block hold these rows (R,) of those that numbers were given for, in this order.
+
+    With None they hold all of them, whatever was chosen outside.
+    """
     before = getattr(_active, "chosen", None)
-    _active.chosen = chosen if before is None else before[chosen.to(before.device)]
+    _active.chosen = chosen if before is None or chosen is None else before[chosen.to(before.device)]
     try:
         yield
     finally:

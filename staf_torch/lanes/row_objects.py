@@ -310,6 +310,8 @@ class _Merge:
         raise self._differ(values, name)
 
     def _dict(self, values: list[dict[Any, Any]], name: str) -> dict[Any, Any]:
+        if name.endswith("_hooks"):  # their keys count all hooks of the process
+            values = [dict(zip(values[0], each.values(), strict=False)) for each in values]
         keys = [key for key in values[0] if key != BOUND]
         if any([key for key in value if key != BOUND] != keys for value in values):
             raise self._differ([list(value) for value in values], name)

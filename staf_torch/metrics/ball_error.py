@@ -12,6 +12,8 @@ from ..centers import probe_points
 from ..lanes import Program, reduce, shared_program
 from ..lanes.compiled_methods import undecided, worth
 from ..lanes.plain_time import PlainTime
+from ..lanes.row_numbers import over_rows, points_of_rows, some_rows
+from ..lanes.row_objects import made_by_rows
 from ..local_basis import NewtonSpace, evaluate_scaled, scale
 from ..numerics.linalg import condition_number
 
@@ -72,7 +74,9 @@ class StateErrorPass:
             ideal: the paper's w with the ideal weights, (..., T, M).
         """
         if self._fixed is None:
-            self._fixed = _Fixed.of(self._basis, x, self._points)
+            with some_rows(None):
+                self._fixed = made_by_rows(lambda: _Fixed.of(self._basis, x, self._points))
+        times = x.shape[-2] if x.dim() > 2 else 1
         self._seen += x.numel() // x.shape[-1]
         if self._pays():
             row = tuple(part.reshape(-1, part.shape[-1]) for part in (x, coefficients, ideal))
@@ -81,14 +85,15 @@ class StateErrorPass:
                 self._program = shared_program(
                     "the errors on a ball", lambda _, __, row: ((), self._at(*row)), *parts
                 )
-            self.compiled = self._program.compiles((), (), row, steps=1)
-            if self.compiled:
-                found: tuple[Tensor, ...] = self._program((), (), row, steps=1)[1]
-                return StateErrors(*(part.reshape(x.shape[:-1]) for part in found))
+            with points_of_rows(len(row[0]) // times, times):
+                self.compiled = self._program.compiles((), (), row, steps=1)
+                if self.compiled:
+                    found: tuple[Tensor, ...] = self._program((), (), row, steps=1)[1]
+                    return StateErrors(*(part.reshape(x.shape[:-1]) for part in found))
         width = self._points * self._basis.count
         times = max(1, _BLOCK // (width * max(1, x.numel() // x.shape[-1] // x.shape[-2])))
         blocks = zip(*(part.split(times, dim=-2) for part in (x, coefficients, ideal)), strict=True)
-        errors = [self._counted(next(blocks)), *(self._at(*block) for block in blocks)]
+        errors = [self._counted(next(blocks)), *(over_rows(self._at, *block) for block in blocks)]
         columns = zip(*errors, strict=True)
         return StateErrors(*(torch.cat(column, dim=-1) for column in columns))
 
@@ -99,9 +104,9 @@ class StateErrorPass:
     def _counted(self, block: tuple[Tensor, ...]) -> StateErrors:
         """The errors at the first states, and how long they take."""
         if self._share or not undecided(self._compile):
-            return self._at(*block)
+            return over_rows(self._at, *block)
         with PlainTime() as plain:
-            errors = self._at(*block)
+            errors = over_rows(self._at, *block)
         self._share = plain.seconds() / plain.build / max(1, errors.ball_error.numel())
         return errors
 
@@ -143,6 +148,9 @@ class StateErrorPass:
 
 def _gradient(function: Target, at: Tensor) -> Tensor:
     """grad f, row by row: (..., n). Not by torch.func, whose first use imports the compiler for a second."""
+    if torch._C._functorch.is_functorch_wrapped_tensor(at):  # numbers of rows, in plain torch
+        gradient: Tensor = torch.func.grad(lambda x: function(x).sum())(at)
+        return gradient
     with torch.enable_grad():
         at = at.clone().requires_grad_()
         values = function(at)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ..approximation.basis import StaFBasis, Target
 from ..engine import ChaseResult
+from ..lanes.row_numbers import over_rows
 from ..optim import UpdateLaw
 from . import Metric
 from .ball_error import StateErrorPass
@@ -134,7 +135,7 @@ class ChaseMetrics:
             condition_number=errors.condition_number,
             **{metric.name: metric.badness(result, chased)[:, at] for metric in self._own},
         )
-        rate = self._law.contraction(errors.condition_number)
+        rate = over_rows(self._law.contraction, errors.condition_number)
         if rate is None:
             return
         rounding = 1e3 * torch.finfo(x.dtype).eps * errors.native_square.abs()

@@ -195,7 +195,7 @@ class HistoryWriter:
         self._hidden.unlink(missing_ok=True)  # of a run that was killed
         flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
         self._file = os.fdopen(os.open(self._hidden, flags, 0o666), "w+b")
-        self._members: dict[str, _Member] = {}
+        self._members: dict[str, _Array] = {}
         self._held: dict[str, np.ndarray] = {}  # (b, C, ...)
         self._row = self._done = 0  # of the block: its first row, and the times that were added
         self._complete = self._fill = 0  # rows with all times; times that are held
@@ -237,8 +237,9 @@ class HistoryWriter:
         self._file.seek(0, os.SEEK_END)
         with zipfile.ZipFile(self._file, "w", zipfile.ZIP_STORED) as archive:
             for name, array in whole.items():
-                with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
-                    np.lib.format.write_array(file, array, allow_pickle=False)
+                content = io.BytesIO()
+                np.lib.format.write_array(content, array, allow_pickle=False)
+                archive.writestr(f"{name}.npy", content.getbuffer())
             archive.filelist += [member.info for member in self._members.values()]
         self._file.close()  # which may find the disk full
         os.replace(self._hidden, self._path)
@@ -256,7 +257,7 @@ class HistoryWriter:
         begin = 0
         for name, piece in pieces.items():
             shape = self._batch, self._times, *piece.shape[2:]
-            self._members[name] = _Member(f"{name}.npy", begin, shape, piece.dtype)
+            self._members[name] = _Array(f"{name}.npy", begin, shape, piece.dtype)
             begin = self._members[name].end
         self._file.truncate(begin)
 
@@ -272,7 +273,7 @@ class HistoryWriter:
         self._fill = 0
 
 
-class _Member:
+class _Array:
     """An array of an archive whose data arrive in any order.
 
     Args:

@@ -167,7 +167,7 @@ def test_more_rows_than_go_through_time_together_change_nothing() -> None:
     problem = chase_problem(settings(*few))
     told: list[int] = []
     kept: dict[int, list[Any]] = {}
-    sink = lambda pieces, row: kept.setdefault(row, []).append(pieces["state"])  # noqa: E731
+    sink = lambda pieces, row, time: kept.setdefault(row, []).append(pieces["state"])  # noqa: E731
     (blocks,) = chase_batch.simulate([problem], [sink], [True], told.append)
     assert sum(told) == 4
     assert [*kept] == [0, 4096]
@@ -187,7 +187,7 @@ def test_a_long_trajectory_is_thinned_for_its_figure_as_if_it_came_in_one_piece(
         settings("dt=0.001", "duration=4.01", "settle_time=0.1", "optimizer.inner_steps=1")
     )
     kept: list[Any] = []
-    (found,) = chase_batch.simulate([problem], [lambda pieces, row: kept.append(pieces)], [True])
+    (found,) = chase_batch.simulate([problem], [lambda pieces, row, time: kept.append(pieces)], [True])
     assert len(kept) >= 20  # progress is seen
     state = np.concatenate([piece["state"] for piece in kept], axis=1)[0]
     assert state.shape[0] == 4011

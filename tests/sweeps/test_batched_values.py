@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import itertools
 import json
+import logging
 import pickle
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import mpmath as mp
 import numpy as np
 import pytest
 from composing import settings
 from omegaconf import DictConfig
+from truth import paper
 
+from staf_torch import rings
 from staf_torch.experiments.adp import LoopSolution, Regulation
 from staf_torch.experiments.gradient_chase import ChaseSolution, GradientChase
 from staf_torch.results import run_record
@@ -94,8 +98,12 @@ BATCHES = {
     "targets": (["target=cosine"], ["target.phase=0.0,1.0", "target.frequency=1,2"]),
     "steps of time": (["system=linear"], ["dt=0.05,0.049", "settle_time=0.3,0.4,9.0"]),
     "integrated": (["system=van_der_pol"], ["dt=0.05,0.049", "initial_state=[1.0,0.0],[0.5,0.5]"]),
+    "plants": (["system=van_der_pol", "kernel=gaussian"], ["system.damping=0.5,1.0"]),
+    "plants that flow": (["system=linear"], ["system.matrix=[[0,1],[-1,0]],[[0,1],[-2,-1]]"]),
+    "directions": (["centers=directions"], ["centers.directions=[[1,0],[0,1]],[[0.6,0.8],[-1,0]]"]),
     "single precision": (["dtype=float32", "target=quadratic"], ["target.matrix=1.0,2.0"]),
 }
+READ_SPECTRA = {"fixed step", "heavy ball", "nesterov"}  # of K, or factor it: weights to 1e-9
 
 
 @pytest.mark.parametrize("name", BATCHES)
@@ -105,7 +113,7 @@ def test_a_member_gets_what_it_gets_alone(name: str) -> None:
     (group,) = groups(cfgs)
     assert group == list(range(len(cfgs)))
     together = GradientChase().solve(cfgs, SHOWN)  # raises where `batching.solve` would run each alone
-    iterated = name not in ("exact", "tangent")  # those weights come from a factor of K
+    iterated = name not in {"exact", "tangent"} | READ_SPECTRA
     digits = 1e-9 if name != "single precision" else 1e-3
     for cfg, found in first_and_last(cfgs, together):
         (alone,) = solutions([cfg])
@@ -117,6 +125,67 @@ def test_a_member_gets_what_it_gets_alone(name: str) -> None:
         numbers = [{k: v for k, v in one.metrics.items() if v is not None} for one in (found, alone)]
         assert numbers[0] == pytest.approx(numbers[1], rel=digits, abs=digits / 10)
         assert np.array_equal(found.outcome.diverged_at, alone.outcome.diverged_at)
+
+
+RADII = ("0.05", "0.1", "0.3")
+
+
+def chased_in_high_precision(states: np.ndarray, radius: float) -> list[list[mp.mpf]]:
+    """The weights of steepest descent from zero, ten iterations a state, three centers, the paper's V."""
+    found, a = [], mp.matrix([0, 0, 0])
+    for x in states.tolist():
+        at = [[x[k] + mp.mpf(radius) * mp.mpf(u[k]) for k in (0, 1)] for u in rings(3).tolist()]
+        k = mp.matrix([[mp.exp(c[0] * d[0] + c[1] * d[1]) for d in at] for c in at])
+        for _ in range(10):
+            g = mp.matrix([*map(paper, at)]) - k * a
+            a += (g.T * g)[0] / (g.T * k * g)[0] * g
+        found.append([*a])
+    return found
+
+
+def test_a_job_in_a_compiled_batch_is_as_close_to_the_truth_as_alone() -> None:
+    """What follows from a radius alone is found once by torch, or in the program of the rows: last digits."""
+    cfgs = compose(["duration=0.9", "settle_time=0.5"], [f"centers.radius={','.join(RADII)}", "seed=1,2"])
+    together = solutions(cfgs)
+    with mp.workdps(50):
+        for k, radius in zip(range(0, 6, 2), RADII, strict=True):
+            (alone,) = solutions([cfgs[k]])
+            for key in ("state", "value"):
+                assert np.array_equal(together[k].history[key], alone.history[key])
+            truth = chased_in_high_precision(alone.history["state"][0], float(radius))
+            size = max(abs(w) for row in truth for w in row)
+            errors = [
+                max(
+                    abs(w - t)
+                    for found, row in zip(one.history["weights"][0].tolist(), truth, strict=True)
+                    for w, t in zip(found, row, strict=True)
+                )
+                for one in (together[k], alone)
+            ]
+            assert errors[0] <= 4 * errors[1] + 1e-13 * size
+
+
+MIXED = ["centers.count=3,6", "centers.radius=0.05,-1,0.2", "kernel=gaussian,polynomial", "seed=1,2"]
+
+
+def test_a_sweep_of_numbers_and_counts_is_one_call_for_each_count(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.DEBUG, "staf_torch")
+    cfgs = compose([], MIXED)
+    chosen = groups(cfgs)
+    assert [len(group) for group in chosen] == [6, 6, 6, 6]
+    found = {
+        k: one for group in chosen for k, one in zip(group, solve([cfgs[k] for k in group]), strict=True)
+    }
+    assert "one after the other" not in caplog.text
+    for k, cfg in enumerate(cfgs):
+        if cfg.centers.radius < 0:
+            assert words(found[k]) == "`ConstantRadius(radius=...)` must be positive; got -1."
+            continue
+        outcome = found[k]
+        assert isinstance(outcome, Computed)
+        if k % 2 == 0:  # alone
+            (alone,) = solutions([cfg])
+            assert outcome.metrics == pytest.approx(alone.metrics, rel=1e-9, abs=1e-10)
 
 
 CLOSED = ("dt=0.005", "duration=0.1", "adp.compile=false", "figures=false")
