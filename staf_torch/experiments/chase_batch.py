@@ -85,15 +85,16 @@ def simulate(
 
     for indices in grouped(range(len(problems)), shared).values():
         by_parts = grouped(indices, lambda i: _Identical(_parts(problems[i])))
-        for alike in _alike([key.parts for key in by_parts], own=bool(problems[indices[0]].metrics)):
+        own = bool(problems[indices[0]].metrics)  # of the user's, which see one problem at a time
+        for alike, joined in _alike([key.parts for key in by_parts], own=own):
             each = [by_parts[_Identical(parts)] for parts in alike]
-            if len(alike) > 1:
-                try:
+            try:
+                if joined is not None:
                     kinds = [k for k, some in enumerate(each) for _ in some]
-                    run([i for some in each for i in some], merged(alike), kinds)
+                    run([i for some in each for i in some], joined, kinds)
                     continue
-                except _REFUSALS as error:
-                    _log.debug("%d problems run one after the other: %s", len(alike), error)
+            except _REFUSALS as error:
+                _log.debug("%d problems run one after the other: %s", len(alike), error)
             for parts, some in zip(alike, each, strict=True):
                 run(some, parts, [0] * len(some))
     return [found[i] for i in range(len(problems))]
@@ -126,20 +127,23 @@ class _Identical:
         return isinstance(other, _Identical) and self._ids == other._ids
 
 
-def _alike(parts: Sequence[_Objects], *, own: bool) -> list[list[_Objects]]:
-    """Return the parts in sets whose members differ in numbers alone.
+def _alike(parts: Sequence[_Objects], *, own: bool) -> list[tuple[Sequence[_Objects], _Objects | None]]:
+    """Return the parts in sets, with the objects that have the numbers of all of a set; None of one alone.
 
     Args:
         parts: of problems.
-        own: whether a metric of the user's own reads them, which sees one problem at a time.
+        own: whether each stays alone.
     """
-    if own:
-        return [[each] for each in parts]
-    if len(parts) == 1:
-        return [list(parts)]
-    keys = [Contents(0, *each).key for each in parts]
+    if own or len(parts) == 1:
+        return [([each], None) for each in parts]
+    try:
+        return [(parts, merged(parts))]
+    except ValueError:  # they differ in more than numbers
+        keys = [Contents(*each, telling=True).key for each in parts]
     sets = grouped(range(len(parts)), lambda i: (i,) if keys[i] is None else keys[i])
-    return [[parts[i] for i in indices] for indices in sets.values()]
+    if len(sets) == 1:
+        return [([each], None) for each in parts]
+    return [found for some in sets.values() for found in _alike([parts[i] for i in some], own=False)]
 
 
 def _run(
