@@ -53,6 +53,11 @@ def refuse_gradient(call: str, **given: Any) -> tuple[Tensor, ...]:
     return tuple(layers)
 
 
+def wants_gradient(*given: Any) -> bool:
+    """Return whether autograd is on and something requires a gradient: tensors, and what objects hold."""
+    return torch.is_grad_enabled() and any(part for value in given for part in _wanting(value))
+
+
 def gradients_of(call: str, **given: Any) -> tuple[Tensor, ...]:
     """Return the tensors that require a gradient, of an object that keeps numbers made from them: as
     `refuse_gradient` where autograd is on, and where it is off all that somebody may ask for later.

@@ -79,8 +79,10 @@ def _stack(name: str, matrix: object, rule: str) -> Tensor:
             raise fail("Linear", name, rule, tuple(matrix.shape))
         number("Linear", name, matrix)
         return matrix.double()
-    rows = _rows(name, matrix, rule)
+    learned = matrix if isinstance(matrix, Tensor) and matrix.requires_grad else None
+    rows = _rows(name, matrix if learned is None else learned.detach(), rule)
     length = len(rows) if name == "matrix" else len(rows[0])
-    return torch.tensor(
-        [vector("Linear", name, row, length) for row in rows], dtype=torch.float64, device="cpu"
-    )
+    numbers = [vector("Linear", name, row, length) for row in rows]
+    if learned is not None:  # a parameter as it is, to be learned
+        return learned if learned.dtype == torch.float64 else learned.double()
+    return torch.tensor(numbers, dtype=torch.float64, device="cpu")

@@ -16,7 +16,7 @@ from torch import Tensor
 from ...approximation.basis import StaFBasis
 from ...lanes import Program
 from ...lanes.compiled_methods import undecided, worth
-from ...lanes.gradients import without_gradient
+from ...lanes.gradients import wants_gradient
 from ...lanes.loop_program import LoopProgram
 from ...lanes.opaque import opaque
 from ...lanes.row_numbers import each_row, over_rows, some_rows
@@ -159,7 +159,6 @@ _OF_ROWS = ("state", "control", "running_cost", "recorded", "frozen_at", "carrie
 
 
 @opaque
-@without_gradient("adp.simulate", "controller", "system", "cost", "x0")
 @beside
 def simulate(
     controller: Controller | Policy,
@@ -213,15 +212,22 @@ def simulate(
             takes more than some seconds says how far it is. Both agree to 1e-12; True or False fix the bits.
         progress: called with the number of steps done since its last call.
 
+    What has ``requires_grad``, x0, numbers of the plant, of the cost and of the controller, parameters of
+    networks, gets its gradient, compiled where the loop is (`staf_torch/lanes/GRADIENTS.md`).
+
     Raises:
-        ValueError: if an argument breaks its rule, or the plant returns another shape. A set-point at which
-            no input within the bounds holds the plant is a warning in the log.
+        ValueError: if an argument breaks its rule, or the plant returns another shape; if a gradient is wanted
+            by what is a design (an LQR, a filter, a plan) or by a plant that needs an exact step, without
+            ``substeps``. A set-point at which no input within the bounds holds the plant is a warning in the
+            log.
     """
     if not isinstance(controller, Controller):
         if not callable(controller):
             raise fail("simulate", "controller", "must be a Controller or a function of x", controller)
         controller = Feedback(controller)
-    cost = _check(system, cost, x0)
+    learned = wants_gradient(controller, system, cost, x0)
+    with torch.no_grad():
+        cost = _check(system, cost, x0)
     integer("simulate", "steps", steps, least=1)
     integer("simulate", "every", every, least=1)
     if steps % every:
@@ -233,9 +239,10 @@ def simulate(
         dt = controller.period or system.period or _DT
     fastest = math.inf
     if isinstance(controller, Feedback) and x0.device.type == "cpu":
-        controller.check(x0)
-        _check_control(controller, x0, cost.inputs)
-        fastest = warn_if_unstable(controller.policy, system, cost, positive_real("simulate", "dt", dt))
+        with torch.no_grad():
+            controller.check(x0)
+            _check_control(controller, x0, cost.inputs)
+            fastest = warn_if_unstable(controller.policy, system, cost, positive_real("simulate", "dt", dt))
     # Of slow plants one step is tried, as rows that are fast elsewhere run again.
     tried = 1 if substeps is None and fastest * dt <= RESOLVED else substeps
     holding = None
@@ -249,6 +256,9 @@ def simulate(
         "holding": holding,
     }
     loop = ClosedLoop(controller, system, cost, dt=dt, **more)  # type: ignore[arg-type]
+    if learned and loop.holding.table is not None and wants_gradient(system, cost):
+        rule = "must be given where the plant or its cost requires a gradient: its exact step is a number"
+        raise fail("simulate", "substeps", rule, substeps)
     loop.to(x0.device)
     for basis in (part for part in loop.modules() if isinstance(part, StaFBasis)):
         basis.check_learned()
@@ -259,14 +269,16 @@ def simulate(
             "the closed loop runs in plain torch, slower: its plant is no torch (NumPy, a simulator)"
         )
     whole = _LoopRun(x0, steps, every, _seeds(seed, len(x0)), compile, progress)
-    with torch.no_grad():
+    with torch.set_grad_enabled(learned):
         result, last = whole.of(loop)
+    with torch.no_grad():
         seen = result.state[:, :: max(1, result.state.shape[1] // _SEEN)]
         reach = wrap(seen, system.periodic).abs().amax(-1).amax(-1)
         strained = ~(last.bent <= BENT * reach) & torch.isfinite(reach)
         if integrator == "euler" and system.period is None:
             strained[:_EULER] = True
-        if bool(strained.any()):
+    if bool(strained.any()):
+        with torch.set_grad_enabled(learned):
             result = whole.checked(loop, result, strained, substeps is None and integrator != "euler")
 
     def again(other: Controller, start: Tensor) -> LoopResult:
@@ -330,14 +342,15 @@ class _LoopRun:
     def checked(self, loop: ClosedLoop, result: LoopResult, rows: Tensor, again: bool) -> LoopResult:
         """Return the result in which the rows of a mask (B,) that need more steps took them, if they may run
         ``again``; warn of those that are wrong by more than a little."""
-        rest, at = loop.system.resting_input(), rows.nonzero().squeeze(1)
-        frozen = result.diverged[at]
-        with some_rows(at):
-            moves = hardest(loop.holding, result.state[at], result.control[at], rest, frozen)
+        at = rows.nonzero().squeeze(1)
+        with torch.no_grad(), some_rows(at):
+            frozen = result.diverged[at]
+            rest, states, controls = loop.system.resting_input(), result.state[at], result.control[at]
+            moves = hardest(loop.holding, states, controls, rest, frozen)
             found = needed(loop.holding, *moves, frozen)
         warn_of_models(loop.controller, *moves)
         if not again:
-            with some_rows(at):
+            with torch.no_grad(), some_rows(at):
                 one = needed(loop.holding, *moves, torch.ones_like(frozen), most=1)
             warn_of_errors(loop.holding, at, one, "Leave `substeps` and `integrator` as they are by default.")
             return result
