@@ -15,7 +15,7 @@ from ..approximation.basis import StaFBasis
 from ..centers import StateFollowingCenters, cross_polytope
 from ..kernels import ExponentialKernel
 from ..lanes import ready, where_rows
-from ..lanes.gradients import marked, refuse_gradient, without_gradient
+from ..lanes.gradients import defer_gradient, marked, without_gradient
 from ..lanes.opaque import opaque
 from ..lanes.row_objects import refuse_rows
 from ..numerics.checks import choice, flag, integer, positive_real
@@ -94,12 +94,12 @@ class NearOptimal(SampledRollout):
     @opaque
     def forward(self, x: Tensor) -> Tensor:
         """u: (..., n) -> (..., m)."""
-        if self.plan:  # without plans it has a derivative with respect to x
-            refuse_gradient("near_optimal(plan=True)", x=x)
-        if self.lqr.layers and torch.is_grad_enabled() and not x.requires_grad:
+        # Without plans it has a derivative with respect to x.
+        late = defer_gradient("near_optimal(plan=True)", x=x) if self.plan else ()
+        if late or (self.lqr.layers and torch.is_grad_enabled() and not x.requires_grad):
             with torch.no_grad():
                 u: Tensor = self(x)
-            return marked("near_optimal", self.lqr.layers, u)
+            return marked("near_optimal", late or self.lqr.layers, u)
         if self.memory is not None:
             return self.memory(x)  # type: ignore[no-any-return]
         u, planner = super().forward(x), self.planner

@@ -1,9 +1,9 @@
 """Gradients that nobody computes: refused where one is wanted, so that none is absent without a word.
 
-Planners, filters of streams and closed loops run without autograd. Asked with a tensor that requires a
-gradient, while autograd is on, they refuse in one sentence. Parameters of torch's own layers require one by
-default, and a network that was trained elsewhere is no question for a derivative: these are taken as numbers,
-and what is computed with them refuses the backward pass to them.
+Planners, designs and filters of streams run without autograd. Asked with a tensor that requires a gradient,
+while autograd is on, they refuse in one sentence. Parameters of torch's own layers require one by default,
+and a network that was trained elsewhere is no question for a derivative; in a loop a state follows from what
+requires one. These are taken as numbers, and what is computed with them refuses the backward pass.
 """
 
 from __future__ import annotations
@@ -51,6 +51,22 @@ def refuse_gradient(call: str, **given: Any) -> tuple[Tensor, ...]:
             raise ValueError(f"`{call}` computes no gradient, and `{name}` holds {what}: {_REMEDY}.")
         layers += some
     return tuple(layers)
+
+
+def defer_gradient(call: str, **given: Any) -> tuple[Tensor, ...]:
+    """Refuse as `refuse_gradient`, but for a tensor that follows from others, as in a loop of which a
+    gradient is wanted, refuse the backward pass and not the call.
+
+    Args:
+        call, given: as there.
+
+    Returns:
+        The tensors and the parameters of layers that require one, for `marked`.
+    """
+    if not torch.is_grad_enabled():
+        return ()
+    late = {n: v for n, v in given.items() if isinstance(v, Tensor) and v.requires_grad and not v.is_leaf}
+    return *late.values(), *refuse_gradient(call, **{n: v for n, v in given.items() if n not in late})
 
 
 def wants_gradient(*given: Any) -> bool:
@@ -108,7 +124,7 @@ def without_gradient(call: str, *names: str) -> Callable[[Callable[_P, _R]], Cal
                 return function(*args, **kwargs)
             given = {name: args[k] if k < len(args) else kwargs.get(name) for name, k in places}
             given = {"the object" if name == "self" else name: value for name, value in given.items()}
-            layers = refuse_gradient(call, **given)
+            layers = defer_gradient(call, **given)
             with torch.no_grad():
                 result = function(*args, **kwargs)
             return marked(call, layers, result) if layers else result
@@ -196,5 +212,5 @@ class _Unserved(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *_: Tensor) -> Any:
-        told = "and holds a network whose parameters require one"
+        told = "and one is wanted through it"
         raise ValueError(f"`{ctx.call}` computes no gradient, {told}: {_REMEDY}.")

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..lanes.gradients import refuse_gradient
+from ..lanes.gradients import defer_gradient, marked
 from ..numerics.differences import Apart, central_slopes
 from .base import Linearisation
 from .numpy_in_torch import InTorch, agrees
@@ -162,12 +162,14 @@ class BlackBox:
             return False
 
     def _numpy(self, x: Tensor, u: Tensor) -> Tensor:
-        refuse_gradient(f"{self._call} of a function without derivatives", x=x, u=u)
+        call = f"{self._call} of a function without derivatives"
+        late = defer_gradient(call, x=x, u=u)
         if self._tensors:
             found: Tensor = self._function(x.detach(), u.detach())
-            return found
+            return marked(call, late, found)
         after = self._function(x.detach().cpu().numpy(), u.detach().cpu().numpy())
-        return torch.as_tensor(np.asarray(after, dtype=np.float64), device="cpu").to(x)
+        found = torch.as_tensor(np.asarray(after, dtype=np.float64), device="cpu").to(x)
+        return marked(call, late, found)
 
     def _try(self, x: Tensor, u: Tensor) -> None:
         generator = torch.Generator().manual_seed(0)

@@ -56,13 +56,6 @@ BOX = systems.StepPlant(numpy_step, dim=2, inputs=1, dt=0.1)
 BASIS = st.StaFBasis(st.GaussianKernel(), st.StateFollowingCenters(st.rings(3), radius=0.1))
 REGRESSOR = st.StaFRegressor().fit(*samples())
 WITHOUT: dict[str, tuple[Callable[[Tensor], Any], Tensor]] = {
-    "adp.simulate controller": (lambda k: loop(lambda x: -x @ k.mT), tensor([[1.0, 2.0]])),
-    "adp.simulate x0": (lambda x: loop(x=x), X0),
-    "adp.simulate system": (lambda g: loop(plant=Gravity(g)), tensor(1.0)),
-    "adp.simulate cost": (
-        lambda q: loop(cost=adp.QuadraticCost(q, 0.1, dim=2, inputs=1)),
-        torch.eye(2).double(),
-    ),
     "LQR system": (lambda g: adp.LQR(Gravity(g), COST).k, tensor(1.0)),
     "LQR cost": (lambda r: adp.LQR(PLANT, adp.QuadraticCost(1.0, r, 2, 1), 0.1).p, tensor([[0.1]])),
     "SampledProblem.of plant": (lambda g: adp.SampledProblem.of(Gravity(g), COST, dt=0.05).k, tensor(1.0)),
@@ -96,8 +89,6 @@ WITHOUT: dict[str, tuple[Callable[[Tensor], Any], Tensor]] = {
         tensor([[9.0, 2.0]]),
     ),
     "find_equilibrium plant": (lambda g: systems.find_equilibrium(Gravity(g), [0.1, 0.0]).state, tensor(1.0)),
-    "StepPlant x": (lambda x: BOX.step(x, x[:, :1].detach()), X0),
-    "Linear matrix": (lambda a: systems.Linear(a, [[0.0], [1.0]]).drift(X0), torch.eye(2).double()),
     "Bounds low": (lambda low: systems.Bounds(low, None, 1).low, tensor([-1.0])),
     "predict x": (REGRESSOR.predict, X0[0]),
     "add coefficients": (
@@ -122,20 +113,17 @@ def test_what_runs_without_autograd_refuses_what_requires_a_gradient(name: str) 
         function(at.clone().requires_grad_())
 
 
-def test_the_gradient_of_a_closed_loop_with_a_penalty_is_no_half_of_it() -> None:
-    k = tensor([[1.0, 2.0]]).requires_grad_()
-    with pytest.raises(ValueError, match=r"`adp.simulate` computes no gradient, and `controller` holds"):
-        (loop(lambda x: -x @ k.mT).mean() + 0.1 * k.square().sum()).backward()
+def test_the_gradient_of_a_closed_loop_is_there_for_all_that_it_reads() -> None:
     gain = nn.Parameter(torch.ones(1, 2).double())
     own = nn.Module()
     own.gain, own.forward = gain, lambda x: -x @ gain.mT  # type: ignore[method-assign]
-    with pytest.raises(ValueError, match="`controller` holds a tensor"):
-        loop(own)
     own.lock = threading.Lock()  # what cannot be written down hides nothing beside it
-    with pytest.raises(ValueError, match="`controller` holds a tensor"):
-        loop(own)
+    assert loop(own).requires_grad
     gain.requires_grad_(False)
     assert not loop(own).requires_grad
+    stiff = systems.Linear(tensor([[0.0, 1.0], [-1e4, -200.0]]).requires_grad_(), [[0.0], [1.0]])
+    with pytest.raises(ValueError, match=r"simulate\(substeps=...\)` must be given where the plant"):
+        loop(plant=stiff)
 
 
 def test_a_policy_that_plans_has_no_derivative() -> None:
@@ -151,6 +139,9 @@ def test_what_is_designed_without_autograd_refuses_to_be_asked_later() -> None:
         lqr = adp.LQR(Gravity(tensor(1.0).requires_grad_()), COST)
     with pytest.raises(ValueError, match="`LQR` computes no gradient"):
         lqr(X0).sum().backward()
+    after = BOX.step(X0.clone().requires_grad_(), X0[:, :1])
+    with pytest.raises(ValueError, match="of a function without derivatives` computes no gradient"):
+        after.sum().backward()
 
 
 POLICIES: dict[str, tuple[Callable[..., Tensor], tuple[Tensor, ...]]] = {
@@ -168,6 +159,13 @@ POLICIES: dict[str, tuple[Callable[..., Tensor], tuple[Tensor, ...]]] = {
         (X0, tensor(1.3), tensor(2.0)),
     ),
     "a constant V": (lambda x: adp.hjb_residual(PLANT, COST, lambda y: 0 * y[..., 0] + 1, x), (X0,)),
+    "adp.simulate": (
+        lambda k, x, g, q: loop(
+            lambda x: -x @ k.mT, Gravity(g), adp.QuadraticCost(q, 0.1, dim=2, inputs=1), x
+        ),
+        (tensor([[1.0, 2.0]]), X0, tensor(1.0), tensor([1.0, 2.0])),
+    ),
+    "Linear": (lambda a: loop(plant=systems.Linear(a, [[0.0], [1.0]])), (torch.eye(2).double(),)),
     "systems.simulate": (lambda x, g: systems.simulate(Gravity(g), x, dt=0.1, steps=2), (X0, tensor(1.0))),
 }
 

@@ -216,8 +216,8 @@ def simulate(
     networks, gets its gradient, compiled where the loop is (`staf_torch/lanes/GRADIENTS.md`).
 
     Raises:
-        ValueError: if an argument breaks its rule, or the plant returns another shape; if a gradient is wanted
-            by what is a design (an LQR, a filter, a plan) or by a plant that needs an exact step, without
+        ValueError: if an argument breaks its rule, or the plant returns another shape; if a gradient is
+            wanted by a design (an LQR, a filter, a plan), or by a plant that needs an exact step without
             ``substeps``. A set-point at which no input within the bounds holds the plant is a warning in the
             log.
     """

@@ -120,7 +120,7 @@ class RecedingHorizon(Controller):
         if self._compile and self._search is not None and self.memory is None:
             self._improved.hasten()
 
-    @without_gradient("RecedingHorizon.init", "x0")
+    @without_gradient("RecedingHorizon.init", "x0", "self")
     def init(self, x0: Tensor) -> Following:
         """The first plan, from the states x0 (B, n)."""
         x0 = trailing(type(self).__name__, "x0", x0, 2).to(self.problem.goal.dtype)
@@ -137,7 +137,7 @@ class RecedingHorizon(Controller):
         plan = resting(self.problem, self.problem.goals(x0, self.steps)[:, :-1])
         return Following(plan, torch.zeros_like(plan[:, 0, 0]))
 
-    @without_gradient("RecedingHorizon.step", "x")
+    @without_gradient("RecedingHorizon.step", "x", "self")
     def step(self, x: Tensor, carried: Following, uniform: Tensor, dt: float) -> tuple[Tensor, Following]:
         """The first control of the improved plan (B, m), and the plan a step further on."""
         step = self._followed if self._search is None else self._improved
@@ -279,7 +279,7 @@ class StrainedPlans(Controller):
     def label(self) -> str:
         return type(self.policy).__name__
 
-    @without_gradient("NearOptimal.controller().init", "x0")
+    @without_gradient("NearOptimal.controller().init", "x0", "self")
     def init(self, x0: Tensor) -> Following:
         """The first plans from x0 (B, n), of the rows that need one.
 
@@ -293,7 +293,7 @@ class StrainedPlans(Controller):
         # Saves work: the best of several takes a tenth of a second.
         return where_rows(self._strained(x0), self._begun.init, x0, _without(self._begun.idle(x0)))
 
-    @without_gradient("NearOptimal.controller().step", "x")
+    @without_gradient("NearOptimal.controller().step", "x", "self")
     def step(self, x: Tensor, carried: Following, uniform: Tensor, dt: float) -> tuple[Tensor, Following]:
         def planned(now: tuple[Tensor, Following, Tensor]) -> tuple[Tensor, Following]:
             x, carried, uniform = now

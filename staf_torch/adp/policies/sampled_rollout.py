@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ...approximation.basis import StaFBasis
 from ...lanes import compiled, each, repeat, scan
-from ...lanes.gradients import refuse_gradient
+from ...lanes.gradients import defer_gradient, marked
 from ...numerics.box import LARGEST, box_minimum
 from ...numerics.checks import fail, integer, positive_real, trailing
 from ...numerics.default_device import beside
@@ -286,15 +286,17 @@ class FollowedSimulator:
     bounds: Bounds
 
     def __call__(self, x: Tensor, steps: int) -> tuple[Tensor, Tensor]:
-        refuse_gradient(f"{type(self.plant).__name__} of a function without derivatives", x=x)
-        rows = x.reshape(-1, x.shape[-1]).to("cpu", torch.float64).numpy()
+        call = f"{type(self.plant).__name__} of a function without derivatives"
+        late = defer_gradient(call, x=x)
+        rows = x.detach().reshape(-1, x.shape[-1]).to("cpu", torch.float64).numpy()
         linear = type(self.base) is LQR and type(self.base.cost) is QuadraticCost
         feedback = self._linear() if linear else self._asked
         states, controls = self.plant.function.follow(rows, feedback, steps)
-        return (
+        found = (
             torch.from_numpy(states).to(x).view(*x.shape[:-1], *states.shape[1:]),
             torch.from_numpy(controls).to(x).view(*x.shape[:-1], *controls.shape[1:]),
         )
+        return marked(call, late, found)
 
     def _linear(self) -> Callable[[Numbers], Numbers]:
         """The LQR within its bounds, in NumPy."""

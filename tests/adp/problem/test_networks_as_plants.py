@@ -75,7 +75,8 @@ def test_every_planner_takes_networks_and_refuses_the_backward_pass_to_them(
     ):
         run = adp.simulate(planner, plant, cost, X0, dt=0.05, steps=2, compile=False)
         assert torch.isfinite(run.cost).all()
-        refuses(run.cost, "adp.simulate")
+        if isinstance(planner, adp.RecedingHorizon):
+            refuses(run.cost, "RecedingHorizon.step")
     if plant.period is None:
         shot = adp.DirectShooting(plant, cost, horizon=0.3, intervals=6, terminal=0.0).solve(X0)
         torch.testing.assert_close(shot.value, plan.cost, rtol=0.05, atol=1e-4)
@@ -94,7 +95,8 @@ def test_a_learnt_plant_has_the_regulator_of_the_same_plant_without_parameters()
 def test_policies_and_constraints_that_are_networks_run_and_are_filtered() -> None:
     policy, plant = network(2, 1), systems.Pendulum()
     run = adp.simulate(adp.Feedback(policy), plant, COST, X0, dt=0.05, steps=2, compile=False)
-    refuses(run.state, "adp.simulate")
+    (wanted,) = torch.autograd.grad(run.state.sum(), policy[0].weight)
+    assert torch.isfinite(wanted).all()
     wall = network(2, 1)
     filtered = adp.SafetyFilter(policy, plant, lambda x, t: 2 + wall(x)[..., 0], dt=0.05, low=-5.0, high=5.0)
     assert torch.isfinite(filtered(X0)).all()
