@@ -47,9 +47,8 @@ class Reach(NamedTuple):
 def drawn(cost: Cost, width: Tensor, count: int, seed: int) -> Tensor:
     """States drawn uniformly from the box of half widths (n,) around the set-point, (count, n)."""
     generator = torch.Generator().manual_seed(seed)
-    away = width * (
-        2 * torch.rand(count, cost.dim, dtype=torch.float64, generator=generator, device="cpu") - 1
-    )
+    uniform = torch.rand(count, cost.dim, dtype=torch.float64, generator=generator, device="cpu")
+    away = width * (2 * uniform.to(width) - 1)
     return away if cost.target is None else away + cost.target
 
 

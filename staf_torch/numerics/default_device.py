@@ -1,15 +1,16 @@
-"""New tensors beside those that are given, whatever torch's default device is."""
+"""New tensors beside those that are given, whatever torch's default device is; designs on the CPU."""
 
 from __future__ import annotations
 
 import contextlib
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import ParamSpec, TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.utils import _device
+from torch.utils._pytree import tree_map_only
 
 Given = ParamSpec("Given")
 Found = TypeVar("Found")
@@ -36,3 +37,37 @@ def beside(function: Callable[Given, Found]) -> Callable[Given, Found]:
             return function(*args, **more)
 
     return placed
+
+
+def device_of(*given: object) -> torch.device:
+    """Return the device of the first tensor among tensors and those that modules hold, else the CPU."""
+    return next((each.device for each in _tensors(given)), torch.device("cpu"))
+
+
+def designed_on_cpu(function: Callable[Given, Found]) -> Callable[Given, Found]:
+    """Decorate a design by small matrices: computed on the CPU, its tensors where those given are.
+
+    A Riccati equation or a table of exponentials is no work for a device, branches on values, and has the
+    same bits wherever the run is.
+    """
+
+    @functools.wraps(function)
+    def designed(*args: Given.args, **more: Given.kwargs) -> Found:
+        devices = (each.device for each in _tensors((*args, *more.values())) if not each.is_cpu)
+        device = next(devices, None)
+        if device is None:
+            return function(*args, **more)
+        args, more = tree_map_only(Tensor, Tensor.cpu, (args, more))
+        found: Found = tree_map_only(Tensor, lambda each: each.to(device), function(*args, **more))
+        return found
+
+    return designed
+
+
+def _tensors(given: tuple[object, ...]) -> Iterator[Tensor]:
+    for each in given:
+        if isinstance(each, Tensor):
+            yield each
+        elif isinstance(each, nn.Module):
+            yield from each.parameters()
+            yield from each.buffers()

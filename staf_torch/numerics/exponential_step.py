@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from ..lanes import scan
+from .default_device import designed_on_cpu
 from .linalg import exponential
 
 TOLERANCE = 1e-6  # error of a hold or a step of a trajectory, relative to the state
@@ -67,6 +68,7 @@ def quadratic_integral(matrix: Tensor, rate: Tensor, length: float) -> tuple[Ten
     return flow, 0.5 * (paid + paid.mT)
 
 
+@designed_on_cpu
 def exponential_step(
     linear: Tensor, h: float, curvature: Tensor | None = None, discount: float = 0.0
 ) -> ExponentialStep:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from ..lanes.one_thread import alone
 from .checks import fail, positive_real, real, vector
+from .default_device import designed_on_cpu
 
 Matrix = float | Sequence[float] | Sequence[Sequence[float]] | Tensor
 
@@ -84,6 +85,7 @@ def positive_semidefinite(call: str, name: str, matrix: Tensor, size: int) -> Te
     return matrix.to(torch.float64)
 
 
+@designed_on_cpu
 def unstabilisable_mode(a: Tensor, b: Tensor, discrete: bool = False) -> complex | None:
     """An eigenvalue of A with Re >= 0, or |.| >= 1, that no input reaches (Hautus), None if there is none.
 
@@ -105,6 +107,7 @@ def unstabilisable_mode(a: Tensor, b: Tensor, discrete: bool = False) -> complex
     return None
 
 
+@designed_on_cpu
 def check_modes(a: Tensor, b: Tensor, q: Tensor, *, name: str, discrete: bool = False) -> None:
     """Refuse a linear plant with a mode that does not decay and that no input reaches or no cost sees.
 
@@ -149,6 +152,7 @@ def solver(name: str) -> Callable[..., Any]:
     return found
 
 
+@designed_on_cpu
 def riccati(a: Tensor, b: Tensor, q: Tensor, r: Tensor, *, name: str = "the system") -> Tensor:
     """P >= 0 with A'P + PA - P B R^-1 B'P + Q = 0: the optimal value x'Px of the linear plant.
 
@@ -174,6 +178,7 @@ def riccati(a: Tensor, b: Tensor, q: Tensor, r: Tensor, *, name: str = "the syst
     return 0.5 * (p + p.mT)
 
 
+@designed_on_cpu
 def discrete_riccati(a: Tensor, b: Tensor, paid: Tensor) -> tuple[Tensor, Tensor]:
     """P and K of x+ = A x + B u that pays z'Wz a step, z = (x, u): the best control -K x, of the value x'Px.
 

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from ..lanes.row_objects import OfRows
 from ..numerics.angles import wrap
 from ..numerics.checks import trailing
+from ..numerics.default_device import device_of
 from ..numerics.shown import limits, settings, sizes
 from .bounds import Bounds
 
@@ -95,6 +96,11 @@ class Plant(nn.Module, metaclass=OfRows):
     bounds: Bounds | None = None
     period: float | None = None
 
+    def __init__(self) -> None:
+        super().__init__()
+        where = torch.empty(0, dtype=torch.float64, device="cpu")
+        self.register_buffer("_where", where, persistent=False)  # the device of a plant without numbers
+
     @property
     def traceable(self) -> bool:
         """Return whether the plant is torch all through, so that it can be differentiated and compiled."""
@@ -102,11 +108,11 @@ class Plant(nn.Module, metaclass=OfRows):
 
     def equilibrium(self) -> Tensor:
         """The state at which the plant rests under `resting_input`, (n,): zeros unless it says else."""
-        return torch.zeros(self._size(), dtype=torch.float64, device="cpu")
+        return torch.zeros(self._size(), dtype=torch.float64, device=device_of(self))
 
     def resting_input(self) -> Tensor:
         """The input that holds the plant at its equilibrium, (m,): zeros unless it says else."""
-        return torch.zeros(self.inputs, dtype=torch.float64, device="cpu")
+        return torch.zeros(self.inputs, dtype=torch.float64, device=device_of(self))
 
     @abc.abstractmethod
     def motion(self, x: Tensor, u: Tensor) -> Tensor:

@@ -65,7 +65,7 @@ class Bounds:
 
     def measured_from(self, u: Tensor) -> Bounds:
         """The box of u' - u for every admissible u': the bounds of a deviation from u (m,)."""
-        return Bounds(self.low - u, self.high - u, len(self.low))
+        return Bounds(self.low.to(u) - u, self.high.to(u) - u, len(self.low))
 
     def __repr__(self) -> str:
         low, high = all_rows(self.low).tolist(), all_rows(self.high).tolist()

@@ -48,7 +48,9 @@ class TwoState(ControlAffineSystem):
     def optimal_value(self, x: Tensor, state_cost: Tensor, input_cost: Tensor) -> Tensor | None:
         """x1^2/2 + x2^2 for Q = c I, R = c, times c; None for other costs (and as printed: unknown)."""
         scale = input_cost[0, 0].to(state_cost)
-        proportional = torch.equal(state_cost, scale * torch.eye(2, device="cpu").to(state_cost))
+        proportional = torch.equal(
+            state_cost, scale * torch.eye(2, dtype=state_cost.dtype, device=state_cost.device)
+        )
         if self.as_printed or not proportional:
             return None
         return scale.to(x) * (0.5 * x[..., 0].square() + x[..., 1].square())

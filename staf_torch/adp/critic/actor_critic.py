@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ...lanes.row_numbers import RowNumbers
 from ...numerics.checks import copied, fail, positive, trailing, vector
+from ...numerics.default_device import device_of
 from ...systems import ControlAffineSystem
 from ..loop.controller import Controller
 from ..problem.cost import Cost
@@ -166,7 +167,8 @@ def _weights(name: str, value: Initial, count: int) -> Tensor:
 def _check_points(extrapolation: Extrapolation, dim: int) -> None:
     """Refuse points of another space than the plant's, which would fail within the loop."""
     x, uniform = (
-        torch.zeros(1, *rows, dim, dtype=torch.float64, device="cpu") for rows in ((), (extrapolation.draws,))
+        torch.zeros(1, *rows, dim, dtype=torch.float64, device=device_of(extrapolation))
+        for rows in ((), (extrapolation.draws,))
     )
     try:
         shape = tuple(extrapolation(x, uniform).shape)

@@ -14,6 +14,7 @@ from ...centers import StateRadius
 from ...kernels import AnchoredKernel, ExponentialKernel
 from ...lanes.row_objects import OfRows
 from ...numerics.checks import choice, flag, integer, positive_real
+from ...numerics.default_device import device_of
 from ...numerics.forward_mode import jacobian
 
 
@@ -54,7 +55,8 @@ class ValueBasis(nn.Module, metaclass=OfRows):
     def weights_near_square(self) -> list[float]:
         """W with which V^ is nearest to y'y over [-1, 1]^n: a start that often stabilises."""
         generator = torch.Generator().manual_seed(0)
-        y = 2 * torch.rand(1000, self.dim, dtype=torch.float64, generator=generator, device="cpu") - 1
+        uniform = torch.rand(1000, self.dim, dtype=torch.float64, generator=generator, device="cpu")
+        y = 2 * uniform.to(device_of(self)) - 1
         square = y.square().sum(-1, keepdim=True)
         fitted: list[float] = torch.linalg.lstsq(self(y, y), square, driver="gelsd").solution[:, 0].tolist()
         return fitted

@@ -49,11 +49,11 @@ def needed(holding: Holding, x: Tensor, u: Tensor, frozen: Tensor, most: int = M
 
 def _errors(holding: Holding, rows: Tensor, x: Tensor, u: Tensor, known: Tensor) -> Tensor:
     """Return the largest error of a row's holds, relative to its largest state and cost: (R,)."""
-    worst = torch.zeros(len(x), dtype=torch.float64, device="cpu")
+    worst = torch.zeros(len(x), dtype=torch.float64, device=x.device)
     for wrong, size in over_some_rows(holding.doubled, rows, x, u):
         off, large = (torch.where(known, part.view(known.shape), 0.0) for part in (wrong, size))
         large = torch.where(torch.isfinite(large), large, 0.0).amax(1)
-        worst = torch.maximum(worst, (off.amax(1) / large).nan_to_num(math.inf, math.inf).double().cpu())
+        worst = torch.maximum(worst, (off.amax(1) / large).nan_to_num(math.inf, math.inf).double())
     return worst
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from ...lanes import Program, scan
 from ...lanes.tree import Tree
 from ...numerics.checks import fail, integer, one_or_each, positive, positive_real, trailing
+from ...numerics.default_device import device_of
 from ..loop.controller import Controller
 from ..problem.sampled import SampledProblem
 
@@ -88,12 +89,13 @@ class PathIntegral(Controller):
                 raise fail("PathIntegral", "noise", "must be given where an input has no bounds", noise)
         else:
             scale = positive("PathIntegral", "noise", one_or_each("PathIntegral", "noise", noise, m))
-        self.register_buffer("noise", scale)
+        device = device_of(problem)
+        self.register_buffer("noise", scale.to(device))
         self.noise: Tensor
-        self.register_buffer("spread", _hats(self.steps, self.knots))  # (T, knots)
+        self.register_buffer("spread", _hats(self.steps, self.knots).to(device))  # (T, knots)
         self.spread: Tensor
         scales = torch.logspace(0, math.log10(_FINEST), self.samples, dtype=torch.float64, device="cpu")
-        self.register_buffer("scales", scales)  # (S,)
+        self.register_buffer("scales", scales.to(device))  # (S,)
         self.scales: Tensor
         self.draws = -(-self.samples * self.knots * m // n)
         self._roll = Program(self._rolled, name="sampled plans", compile=compile)

@@ -19,7 +19,7 @@ from ...lanes.compiled_methods import Rows, check_states
 from ...lanes.prepared import Plan
 from ...lanes.row_objects import refuse_rows
 from ...numerics.checks import fail, integer, positive_real, trailing
-from ...numerics.default_device import beside
+from ...numerics.default_device import beside, device_of
 from ...numerics.exponential_step import stalls
 from ...systems import Barrier, ControlAffineSystem
 from ..loop.controller import LQR, Policy, Value
@@ -163,7 +163,7 @@ class RolloutPolicy(nn.Module):
     def _check_steps(self, chosen: bool) -> None:
         """Find out by step doubling whether the steps are enough, and take more where they may be chosen."""
         rest = (
-            torch.zeros(self.basis.dim, dtype=torch.float64, device="cpu")
+            torch.zeros(self.basis.dim, dtype=torch.float64, device=device_of(self))
             if self.cost.target is None
             else self.cost.target
         )
@@ -172,7 +172,7 @@ class RolloutPolicy(nn.Module):
             2 * torch.rand(_SAMPLES, self.basis.dim, dtype=torch.float64, generator=generator, device="cpu")
             - 1
         )
-        x, error = rest.double() + self.model.spread * away, math.inf
+        x, error = rest.double() + self.model.spread * away.to(rest.device), math.inf
         now, first = self.rollout(x), self.steps
         while True:
             self.steps *= 2

@@ -240,7 +240,7 @@ class Cost(nn.Module, metaclass=OfRows):
         """Half the second derivative of e'Qe at the set-point, (n, n): Q, or C'QC with C = dy/dx."""
         if self.output is None:
             return self.q
-        at = torch.zeros(self.dim, dtype=torch.float64, device="cpu") if self.target is None else self.target
+        at = self.q.new_zeros(self.dim) if self.target is None else self.target
         slope: Tensor = torch.func.jacrev(self.output)(at).detach()
         return slope.mT @ self.q @ slope
 
@@ -381,7 +381,7 @@ class BoundedInputCost(Cost):
     def _prepare(self) -> None:
         if self.bounds is None:
             raise fail("BoundedInputCost", "bound", "must be given, or low and high", None)
-        rest = torch.zeros_like(self.bounds.low) if self.target_input is None else self.target_input
+        rest = self.r.new_zeros(self.inputs) if self.target_input is None else self.target_input
         box = self.bounds.measured_from(rest)
         around = (box.low < 0) & (box.high > 0) & torch.isfinite(box.high - box.low)
         if not bool(around.all()):

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ...lanes.gradients import without_gradient
 from ...numerics.checks import fail, positive_real
+from ...numerics.default_device import designed_on_cpu
 from ...numerics.differences import STEP, central_slopes
 from ...numerics.exponential_step import quadratic_integral
 from ...numerics.linalg import check_modes, discrete_riccati, exponential, unstabilisable_mode
@@ -36,6 +37,7 @@ class Hold(NamedTuple):
     paid: Tensor  # W, (n + m, n + m)
 
 
+@designed_on_cpu
 def exact_hold(f: Tensor, g: Tensor, q: Tensor, r: Tensor, period: float, *, discount: float = 0.0) -> Hold:
     """Return x' = F x + G u and the integral of x'Qx + u'Ru over one period with u held.
 
@@ -92,13 +94,13 @@ def linear_hold(plant: Plant, cost: Cost, period: float) -> Hold:
     if plant.period is None:
         return exact_hold(f, g, q, cost.r, period, discount=cost.discount)
     share = math.exp(-0.5 * cost.discount * plant.period)
-    z = torch.zeros(len(f) + g.shape[1], len(f) + g.shape[1], dtype=torch.float64, device="cpu")
+    z = f.new_zeros(len(f) + g.shape[1], len(f) + g.shape[1])
     z[: len(f), : len(f)], z[: len(f), len(f) :], z[len(f) :, len(f) :] = (
         f,
         g,
-        torch.eye(g.shape[1], device="cpu").to(g),
+        torch.eye(g.shape[1], dtype=g.dtype, device=g.device),
     )
-    flow, paid = torch.eye(len(z), dtype=torch.float64, device="cpu"), torch.zeros_like(z)
+    flow, paid = torch.eye(len(z), dtype=z.dtype, device=z.device), torch.zeros_like(z)
     rate = plant.period * torch.block_diag(q.double(), cost.r.double())
     for _ in range(periods("linear_hold", plant, period)):
         paid = paid + flow.mT @ rate @ flow
@@ -217,7 +219,7 @@ class HeldLoop(NamedTuple):
                 torch.full_like(at, _PROBE / STEP),
             )
             held = policy(at.unsqueeze(0))[0].double()
-        f, g = (t.double() for t in system.linearisation(at, held))
+        f, g, slope = (t.double().cpu() for t in (*system.linearisation(at, held), slope))
         if not bool(torch.isfinite(torch.cat((f, g, slope.mT), dim=-1)).all()):
             return cls(system, f, g, slope, False)
         basis = _moved(f, g, discrete=system.period is not None)

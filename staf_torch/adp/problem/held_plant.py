@@ -15,6 +15,7 @@ from ...lanes import repeat, scan
 from ...lanes.loops import untraced
 from ...lanes.row_numbers import each_row, met_rows, nonzero
 from ...numerics.checks import integer, positive_real
+from ...numerics.default_device import device_of
 from ...numerics.exponential_step import (
     GRACE,
     MOST,
@@ -357,7 +358,7 @@ class Holding:
             return (
                 self.plant.equilibrium()
                 if self.plant.dim or self.cost is None
-                else torch.zeros(self.cost.dim, dtype=torch.float64, device="cpu")
+                else torch.zeros(self.cost.dim, dtype=torch.float64, device=device_of(self.cost))
             )
         return self.cost.target
 
@@ -370,19 +371,23 @@ class Holding:
         """States around the set-point and inputs, (P, n) and (P, m), at which the plant moves."""
         plant, cost, rest = self.plant, self.cost, self._rest().double()
         generator = torch.Generator().manual_seed(0)
-        x = 2 * torch.rand(_SAMPLES, len(rest), dtype=torch.float64, generator=generator, device="cpu") - 1
+        x = torch.rand(_SAMPLES, len(rest), dtype=torch.float64, generator=generator, device="cpu")
+        x = 2 * x.to(rest) - 1
         x = rest + plant.spread * (x.abs() if isinstance(plant, Clocked) else x)
         still = (
             plant.resting_input().double() if cost is None or cost.target_input is None else cost.target_input
         )
         u = still.expand(_SAMPLES, -1)
         chance = torch.rand(_SAMPLES, u.shape[-1], dtype=torch.float64, generator=generator, device="cpu")
+        chance = chance.to(rest)
         bounds = plant.bounds if cost is None or cost.bounds is None else cost.bounds
         none = torch.full_like(still, math.inf)
         low, high = (-none, none) if bounds is None else (bounds.low.double(), bounds.high.double())
         rate, columns = plant.motion(x, u), []
         for k in range(u.shape[-1]):  # as far as a loop may go in a period
-            pushed = plant.motion(x, u + torch.eye(len(still), dtype=torch.float64, device="cpu")[k]) - rate
+            pushed = (
+                plant.motion(x, u + torch.eye(len(still), dtype=torch.float64, device=still.device)[k]) - rate
+            )
             push = float(pushed.abs().amax(-1).nan_to_num(0.0, 0.0).quantile(0.5))
             width = _MOVED * plant.spread / (self.dt * push) if push > 0 else 1.0
             least, most = (

@@ -127,7 +127,7 @@ def regulated(call: str, plant: Plant, cost: Cost, argument: str = "cost") -> Co
 def set_point(plant: Plant, cost: Cost) -> tuple[Tensor, Tensor]:
     """Return the state and the input, (n,) and (m,), at which a cost around a plant wants it to rest."""
     x = plant.equilibrium() if cost.target is None else cost.target
-    none = torch.zeros(cost.inputs, dtype=torch.float64, device="cpu")
+    none = torch.zeros(cost.inputs, dtype=torch.float64, device=x.device)
     return x, none if cost.target_input is None else cost.target_input
 
 

@@ -17,7 +17,7 @@ from ...lanes.gradients import without_gradient
 from ...lanes.row_objects import refuse_rows
 from ...numerics.angles import turned, unwrapped, wrap
 from ...numerics.checks import fail, integer, trailing
-from ...numerics.default_device import beside
+from ...numerics.default_device import beside, device_of
 from ...numerics.forward_mode import use_forward_mode
 from ...numerics.linalg import Matrix, discrete_riccati, positive_semidefinite, square, unstabilisable_mode
 from ...numerics.row_checks import check_rows, is_ours
@@ -100,8 +100,9 @@ class SampledProblem(nn.Module):
         self.path: Path | None = path
         self.dim = integer("SampledProblem", "dim", dim, least=1)
         self.inputs = integer("SampledProblem", "inputs", inputs, least=1)
-        zeros = torch.zeros(self.dim, dtype=torch.float64, device="cpu")
-        none = torch.zeros(self.inputs, dtype=torch.float64, device="cpu")
+        device = device_of(goal, rest, step)
+        zeros = torch.zeros(self.dim, dtype=torch.float64, device=device)
+        none = torch.zeros(self.inputs, dtype=torch.float64, device=device)
         self.bounds = Bounds(low, high, self.inputs)
         self.register_buffer("goal", zeros if goal is None else goal.double())
         self.register_buffer("rest", none if rest is None else rest.double())
@@ -388,11 +389,11 @@ def _in_pairs(function: Callable[[Tensor], Tensor], z: Tensor, count: int) -> tu
         return torch.cat((found[0], found[1]), dim=-1)
 
     unit = torch.eye(z.shape[-1], dtype=z.dtype, device=z.device)
-    rows, columns = torch.tril_indices(len(unit), len(unit), device="cpu").unbind(0)
+    rows, columns = torch.tril_indices(len(unit), len(unit), device=z.device).unbind(0)
     pairs = torch.cat((unit[rows], unit[columns]), dim=-1).expand(len(z), -1, -1)
     slope, bend = each(along, pairs, together=1).split(count, dim=-1)  # (B, pairs, count)
-    place = torch.zeros(len(unit), len(unit), dtype=torch.int64, device="cpu")
-    place[rows, columns] = place[columns, rows] = torch.arange(len(rows), device="cpu")
+    place = torch.zeros(len(unit), len(unit), dtype=torch.int64, device=z.device)
+    place[rows, columns] = place[columns, rows] = torch.arange(len(rows), device=z.device)
     return slope[:, rows == columns].mT, bend[:, place.flatten()].mT.unflatten(-1, place.shape)
 
 

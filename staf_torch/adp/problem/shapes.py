@@ -7,6 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from ...numerics.default_device import device_of
 from ...numerics.row_checks import check_rows, is_ours
 from ...systems import ControlAffineSystem, Plant
 from ...systems.user_plants import FunctionPlant
@@ -46,7 +47,7 @@ def check_cost(cost: Cost) -> None:
     if is_ours(type(cost)):
         return
     name, x = type(cost).__name__, state_of(cost)
-    u = torch.zeros(cost.inputs, dtype=torch.float64, device="cpu")
+    u = torch.zeros(cost.inputs, dtype=torch.float64, device=x.device)
     check_rows(f"{name}.state_rate", cost.state_rate, [x], sizes=(len(u),))
     check_rows(f"{name}.input_rate", cost.input_rate, [u], sizes=(len(x),))
     check_rows(f"{name}.rate", cost.rate, [x, u])
@@ -68,4 +69,5 @@ def check_policy(call: str, name: str, cost: Cost, *policies: Function) -> None:
 
 def state_of(cost: Cost) -> Tensor:
     """A state to try functions at, (n,): the set-point, or the origin."""
-    return torch.zeros(cost.dim, dtype=torch.float64, device="cpu") if cost.target is None else cost.target
+    zeros = torch.zeros(cost.dim, dtype=torch.float64, device=device_of(cost))
+    return zeros if cost.target is None else cost.target

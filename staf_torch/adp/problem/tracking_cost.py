@@ -100,7 +100,7 @@ class TrackingCost(QuadraticCost):
 
     def set_point(self) -> Tensor:
         """The path at t = 0, without the time, (n,)."""
-        return self.path(torch.zeros((), dtype=torch.float64, device="cpu"))
+        return self.path(self.r.new_zeros(()))
 
     def deviation(self, x: Tensor) -> Tensor:
         """(x - x_d(t), 0), angles in [-pi, pi]: (..., n + 1) -> (..., n + 1)."""

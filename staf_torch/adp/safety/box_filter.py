@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from ...lanes import compiled, repeat
 from ...numerics.checks import fail, positive_real, trailing
+from ...numerics.default_device import device_of
 from ...numerics.runge_kutta import runge_kutta_mean, runge_kutta_stages
 from ...systems import Barrier, Bounds
 from ..loop.controller import Policy
@@ -96,7 +97,7 @@ class BoxFilter(nn.Module):
                 f"so coordinate {self.walls[self.degree.index(0)][0]}."
             )
         table = cases(len(self.walls), self.bounds.low.tolist(), self.bounds.high.tolist())
-        self.register_buffer("table", table)
+        self.register_buffer("table", table.to(device_of(box)))
         self.table: Tensor
 
     def forward(self, s: Tensor) -> Tensor:
@@ -179,7 +180,7 @@ class BoxFilter(nn.Module):
         -> (B, W, m), (B, W)."""
         value, pull = torch.func.vjp(lambda u: self._conditions(s, u, hold, left), u)  # type: ignore[misc]
         # Reverse mode: forward mode in plain torch takes a hundred times as long, for its own reasons.
-        walls = torch.eye(len(self.walls), device="cpu").to(u)
+        walls = torch.eye(len(self.walls), dtype=u.dtype, device=u.device)
         normal = torch.func.vmap(lambda one: pull(one.expand_as(value))[0], out_dims=1)(walls)
         return normal, (normal * u.unsqueeze(-2)).sum(-1) - value
 
@@ -251,7 +252,7 @@ def _degrees(box: Barrier) -> list[int]:
     share = torch.rand(
         _PROBES, size, dtype=torch.float64, generator=torch.Generator().manual_seed(0), device="cpu"
     )
-    x = box.floor.cpu() + (box.ceiling - box.floor).cpu() * share
+    x = box.floor + (box.ceiling - box.floor) * share.to(box.floor)
     rest = plant.resting_input().to(x).expand(_PROBES, -1)
     found = []
     for k in range(size):

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from ...numerics.checks import fail, non_negative, one_or_each, positive, trailing
+from ...numerics.default_device import device_of
 from ...numerics.row_checks import check_rows
 from ...numerics.runge_kutta import runge_kutta_step
 from ...systems import Bounds, Plant, StepPlant
@@ -87,8 +88,8 @@ class Conditions(nn.Module):
         self.holding = Holding("SafetyFilter", plant, None, 0.5 * hold)
         count = len(self.constraints)
         kept = one_or_each("SafetyFilter", "margin", margin, count)
-        self.register_buffer("margin", non_negative("SafetyFilter", "margin", kept))
-        self.register_buffer("decay", torch.ones(count, dtype=torch.float64, device="cpu"))
+        self.register_buffer("margin", non_negative("SafetyFilter", "margin", kept).to(device_of(plant)))
+        self.register_buffer("decay", torch.ones(count, dtype=torch.float64, device=device_of(plant)))
         self.margin: Tensor  # (k,)
         self.decay: Tensor  # (k,) 1/s
         if decay is not None:
@@ -108,8 +109,8 @@ class Conditions(nn.Module):
         self.weak: tuple[bool, ...] = found.weak
         self.apart: bool = found.apart
         if decay is None:
-            self.decay.copy_(torch.tensor(found.decay, dtype=torch.float64, device="cpu"))
-        second = torch.tensor(self.degree, dtype=torch.int64, device="cpu") == 2
+            self.decay.copy_(self.decay.new_tensor(found.decay))
+        second = torch.tensor(self.degree, dtype=torch.int64, device=self.decay.device) == 2
         if bool((second & (self.decay * self.hold > 1)).any()):
             rule = f"must be at most 1/dt = {1 / self.hold:g} where the relative degree is two"
             raise fail("SafetyFilter", "decay", rule, decay)
@@ -262,8 +263,9 @@ class Conditions(nn.Module):
         around = torch.randn(
             _PROBES, self.plant.dim or 0, dtype=torch.float64, generator=generator, device="cpu"
         )
-        x = (self.plant.equilibrium() + around).repeat(len(TIMES), 1)
-        return x, torch.tensor(TIMES, dtype=torch.float64, device="cpu").repeat_interleave(_PROBES)
+        rest = self.plant.equilibrium()
+        x = (rest + around.to(rest.device)).repeat(len(TIMES), 1)
+        return x, torch.tensor(TIMES, dtype=torch.float64, device=x.device).repeat_interleave(_PROBES)
 
     def _degrees(self, degree: int | Sequence[int] | None, x: Tensor, t: Tensor) -> tuple[int, ...]:
         if degree is not None:
@@ -397,7 +399,7 @@ def listed(call: str, constraints: Constraint | Sequence[Constraint], plant: Pla
     several = [constraints] if callable(constraints) else list(constraints)
     if not several or not all(map(callable, several)):
         raise fail(call, "constraints", "must be h(x, t) or a list of them", constraints)
-    x, t = plant.equilibrium(), torch.zeros((), dtype=torch.float64, device="cpu")
+    x, t = plant.equilibrium(), plant.equilibrium().new_zeros(())
     sizes = (len(several), plant.inputs, _PROBES, len(TIMES), _PROBES * len(TIMES))
     for k, h in enumerate(several):
         check_rows(f"{call}(constraints=...)` number {k} `h(x, t)", h, [x], shared=[t], sizes=sizes)

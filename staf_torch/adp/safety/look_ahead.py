@@ -252,8 +252,7 @@ def opposition(of: Conditions, policy: Policy | None) -> Opposed:
     (plus decay times h) and s = its product with B. A mode that grows there, faster than under the policy
     alone, is an unstable zero: the constraint's coordinate must first move the wrong way.
     """
-    count = len(of.constraints)
-    none = Opposed(torch.zeros(count, dtype=torch.float64, device="cpu"), None, None)
+    none = Opposed(torch.zeros_like(of.decay), None, None)
     plant = of.plant
     rest, at = plant.resting_input().double(), plant.equilibrium().double()
     try:
@@ -272,7 +271,7 @@ def opposition(of: Conditions, policy: Policy | None) -> Opposed:
     fast = float(torch.linalg.eigvals(closed).abs().max())
     if alone is not None and alone > _UNSTABLE * fast:
         return none  # the policy brings nothing back by itself
-    rates = torch.zeros(count, dtype=torch.float64, device="cpu")
+    rates = torch.zeros_like(of.decay)
     x, _ = of._around()
     normals = [torch.func.vmap(torch.func.grad(lambda x, h=h: h(x.unsqueeze(0), x.new_zeros(()))[0]))
                for h in of.constraints]  # fmt: skip

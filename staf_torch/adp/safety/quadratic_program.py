@@ -130,7 +130,7 @@ def _interval(wanted: Tensor, unit: Tensor, far: Tensor, low: Tensor, high: Tens
 
 def _in_plane(wanted: Tensor, unit: Tensor, far: Tensor, low: Tensor, high: Tensor) -> Tensor:
     """Two unknowns: the nearest corner or foot that satisfies all, else least squares of what is missing."""
-    sides = torch.eye(2, device="cpu").to(wanted)
+    sides = torch.eye(2, dtype=wanted.dtype, device=wanted.device)
     sides = torch.cat((sides, -sides))
     lines = torch.cat((unit, sides.expand(*unit.shape[:-2], -1, -1)), dim=-2)
     aims = torch.cat((far, torch.cat((low, -high)).to(far).expand(*far.shape[:-1], -1)), dim=-1)
@@ -190,7 +190,7 @@ def _least_squares(wanted: Tensor, unit: Tensor, far: Tensor, low: Tensor, high:
             found += [u, (paid + give * (u - start.unsqueeze(-2)).square().sum(-1)).unsqueeze(-1)]
         return torch.cat(found, dim=-1)
 
-    subsets = torch.tensor(list(itertools.product((0.0, 1.0), repeat=count))[1:], device="cpu").to(wanted)
+    subsets = wanted.new_tensor(list(itertools.product((0.0, 1.0), repeat=count))[1:])
     shape = (*wanted.shape[:-1], *subsets.shape)
     found = each(subset, subsets.expand(shape), dim=wanted.dim() - 1, together=1).unflatten(-1, (5, 3))
     found = found.flatten(-3, -2)

@@ -13,7 +13,7 @@ from torch import Tensor
 from ...lanes import compiled, repeat, where_rows
 from ...lanes.gradients import gradients_of, marked
 from ...numerics.checks import fail, one_or_each, positive, positive_real, trailing
-from ...numerics.default_device import beside
+from ...numerics.default_device import beside, device_of
 from ...numerics.shown import limits, shown
 from ...systems import Bounds, Plant
 from ...systems.bounds import Limit
@@ -182,10 +182,11 @@ class SafetyFilter(Controller):
         self.degree, self.moving = self.conditions.degree, self.conditions.moving
         heavy = one_or_each("SafetyFilter", "weight", 1.0 if weight is None else weight, plant.inputs)
         positive("SafetyFilter", "weight", heavy)
-        self.register_buffer("unit", heavy.rsqrt())
+        device = device_of(plant)
+        self.register_buffer("unit", heavy.rsqrt().to(device))
         self.unit: Tensor  # (m,) of an input, in which distances are measured
-        low_, high_ = self.bounds.low / self.unit, self.bounds.high / self.unit
-        self.register_buffer("table", cases(count, low_.tolist(), high_.tolist()))
+        low_, high_ = (end.to(self.unit) / self.unit for end in (self.bounds.low, self.bounds.high))
+        self.register_buffer("table", cases(count, low_.tolist(), high_.tolist()).to(device))
         self.table: Tensor
         self.ahead = LookAhead(self.conditions, self._policy)
         if self.ahead.acts:
