@@ -58,8 +58,8 @@ class Barrier(ControlAffineSystem):
             raise fail("Barrier", "plant", "must be a ControlAffineSystem with `dim`", plant)
         super().__init__()
         center = plant.equilibrium().double()
-        lows = wall_numbers("Barrier", "low", low, -math.inf, plant.dim)
-        highs = wall_numbers("Barrier", "high", high, math.inf, plant.dim)
+        lows = wall_numbers("Barrier", "low", low, -math.inf, plant.dim).to(center)
+        highs = wall_numbers("Barrier", "high", high, math.inf, plant.dim).to(center)
         sides = ("low", lows, lows >= center, "below"), ("high", highs, highs <= center, "above")
         for name, wall, wrong, side in sides:
             if bool(wrong.any()):

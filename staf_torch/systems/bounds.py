@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 
@@ -40,6 +41,14 @@ class Bounds:
         if not bool((self.low < self.high).all()):
             raise fail("Bounds", "low", f"must be below high, {self.high.tolist()}", self.low.tolist())
 
+    def on(self, device: torch.device) -> Bounds:
+        """Return these bounds with tensors of a device; themselves where they are there."""
+        if self.low.device == device:
+            return self
+        moved = copy.copy(self)
+        moved.low, moved.high = self.low.to(device), self.high.to(device)
+        return moved
+
     @property
     def present(self) -> bool:
         """Return whether any input is bounded."""
@@ -65,7 +74,8 @@ class Bounds:
 
     def measured_from(self, u: Tensor) -> Bounds:
         """The box of u' - u for every admissible u': the bounds of a deviation from u (m,)."""
-        return Bounds(self.low.to(u) - u, self.high.to(u) - u, len(self.low))
+        there = self.on(u.device)
+        return Bounds(there.low - u, there.high - u, len(u))
 
     def __repr__(self) -> str:
         low, high = all_rows(self.low).tolist(), all_rows(self.high).tolist()

@@ -12,6 +12,7 @@ from torch import Tensor
 from ...kernels import Kernel
 from ...lanes.row_objects import OfRows
 from ...numerics.checks import fail, non_negative, positive_real, real, trailing
+from ...numerics.default_device import device_of
 from ...numerics.linalg import row_jacobian
 from ...numerics.pivoted_cholesky import newton_basis
 from ...numerics.riccati import measured, product
@@ -102,7 +103,8 @@ class StreamDrift(metaclass=OfRows):
             raise fail("StreamDrift", "offsets", f"must be numbers (M, {known.dim})", offsets)
         if not bool(torch.isfinite(offsets).all()) or not bool(offsets.any()):
             raise fail("StreamDrift", "offsets", "must be finite, and not all of them 0", offsets)
-        self.known, self.kernel, self.offsets = known, kernel, offsets.double()
+        self.known, self.kernel = known, kernel
+        self.offsets = offsets.double().to(device_of(kernel, known))
         self.radius = float(self.offsets.norm(dim=-1).max())
         self.basis = newton_basis(kernel(self.offsets, self.offsets).detach())
         self.deviation = positive_real("StreamDrift", "deviation", deviation)
@@ -117,7 +119,7 @@ class StreamDrift(metaclass=OfRows):
             lambda x, u: known.rate(x, u),
             dim=dim,
             inputs=known.inputs,
-            theta=[0.0] * (count * dim),
+            theta=self.offsets.new_zeros(count * dim),
             rows=self.rows,
             periodic=known.periodic,
         )

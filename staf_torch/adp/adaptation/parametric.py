@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ...numerics.checks import copied, fail, integer, number
+from ...numerics.default_device import device_of
 from ...numerics.row_checks import check_rows
 from ...systems import Barrier, Bounds, ControlAffineSystem
 from ..problem.cost import Cost
@@ -108,7 +109,7 @@ class ParametricPlant(ControlAffineSystem):
             lambda x, u: plant.drift(x),
             dim=plant._size(),
             inputs=plant.inputs,
-            theta=torch.ones(plant.inputs, dtype=torch.float64, device="cpu"),
+            theta=torch.ones(plant.inputs, dtype=torch.float64, device=device_of(plant)),
             periodic=plant.periodic,
             bounds=plant.bounds,
         )
@@ -200,7 +201,8 @@ class ParametricPlant(ControlAffineSystem):
         lead = self.theta.shape[:-1] or (4,)
         sizes = [(*lead, self.dim or 0), *((*lead, self.inputs),) * 2]
         x, u, v = (
-            torch.rand(size, dtype=torch.float64, generator=generator, device="cpu") - 0.5 for size in sizes
+            torch.rand(size, dtype=torch.float64, generator=generator, device="cpu").to(self.theta) - 0.5
+            for size in sizes
         )
         for name, of, shape in (
             ("regressor", self.regressor, (*x.shape, self.parameters_count)),

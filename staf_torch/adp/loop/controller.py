@@ -234,7 +234,7 @@ class LQR(nn.Module, metaclass=OfRows):
             name = type(system).__name__
             rest = 0.5 * cost.discount * torch.eye(len(a), dtype=a.dtype, device=a.device)
             p = riccati(a - rest, b, still.state_curvature(), cost.r, name=name)
-            k = cost.r_inverse @ b.to(p).mT @ p
+            k = self.cost.r_inverse.to(p) @ b.to(p).mT @ p
         else:
             p, k = held_riccati(system, still, self.period)
         clock = self.cost.dim - len(p)

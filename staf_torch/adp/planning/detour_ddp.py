@@ -341,7 +341,9 @@ class DetourPlans(Controller):
             generator=torch.Generator().manual_seed(0),
             device="cpu",
         ).unbind(0)
-        rest = self.plant.resting_input().double().expand(_PROBES, -1)
+        at_rest = self.plant.resting_input()
+        x, other = x.to(at_rest.device), other.to(at_rest.device)
+        rest = at_rest.double().expand(_PROBES, -1)
         other = torch.cat((other[:, : self.moved], x[:, self.moved :]), dim=-1)
         own, changed = self.plant.velocity(x, rest), self.plant.velocity(other, rest + 1)
         if not torch.equal(own[:, self.moved :], changed[:, self.moved :]):

@@ -20,6 +20,7 @@ from ...numerics.checks import (
     trailing,
     vector,
 )
+from ...numerics.default_device import device_of
 from ...systems import Plant
 from ..loop.controller import Controller, Policy, Value
 from ..problem.cost import Cost
@@ -127,10 +128,11 @@ class DetourRollout(Controller):
         large = torch.tensor(vector("DetourRollout", "sizes", list(sizes)), dtype=torch.float64, device="cpu")
         positive("DetourRollout", "sizes", large)
         long = [integer("DetourRollout", "lengths", length, least=1) for length in lengths]
-        self.register_buffer("axes", along.clone())
-        self.register_buffer("margin", kept)
-        self.register_buffer("fresh", _detours(len(along), large, long))
-        self.register_buffer("changes", _changes(len(along)))
+        device = device_of(plant)
+        self.register_buffer("axes", along.clone().to(device))
+        self.register_buffer("margin", kept.to(device))
+        self.register_buffer("fresh", _detours(len(along), large, long).to(device))
+        self.register_buffer("changes", _changes(len(along)).to(device))
         self.axes: Tensor  # (k, n)
         self.margin: Tensor
         self.fresh: Tensor  # (P, k + 1), the length last

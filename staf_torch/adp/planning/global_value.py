@@ -293,7 +293,9 @@ class GlobalValue(KeptPrecision):
         curvature = self.models[self.entries, 1 + n + n :].unflatten(-1, (n, n))
         along, axes = torch.linalg.eigh(self.region.unsqueeze(-1) * curvature * self.region)
         metric = ((axes * along.abs().unsqueeze(-2)) @ axes.mT).mean(0)
-        metric = metric + _ROUND * metric.diagonal().mean() * torch.eye(n, dtype=torch.float64, device="cpu")
+        metric = metric + _ROUND * metric.diagonal().mean() * torch.eye(
+            n, dtype=torch.float64, device=metric.device
+        )
         frame: Tensor = torch.linalg.cholesky(metric / self.region / self.region.unsqueeze(-1))
         return frame
 
@@ -307,9 +309,7 @@ class GlobalValue(KeptPrecision):
         """Table of values: along the library, and then at the goal."""
         library, count, n = self.library, len(self.library.state), self.problem.dim
         parts = library.state, library.value.unsqueeze(-1), library.gradient, library.curvature.flatten(2)
-        linear = torch.cat(
-            (torch.zeros(1 + n, dtype=torch.float64, device="cpu"), 2 * self.problem.p.flatten())
-        )
+        linear = torch.cat((self.problem.p.new_zeros(1 + n), 2 * self.problem.p.flatten()))
         ends = torch.cat((self._goals(), linear.expand(count, -1)), dim=-1).unsqueeze(1)
         ends = ends.expand(-1, self.lookahead + 1, -1)
         return torch.cat((torch.cat(parts, dim=-1)[:, :-1], ends), dim=1).flatten(0, 1)

@@ -101,7 +101,7 @@ def learn_global_value(
 
     def drawn(count: int) -> Tensor:
         uniform = torch.rand(count, problem.dim, generator=generator, dtype=torch.float64, device="cpu")
-        return problem.goal + width * (2 * uniform - 1)
+        return problem.goal + width.to(problem.goal) * (2 * uniform.to(problem.goal) - 1)
 
     library = swept(memory(_first(search, drawn(trajectories), generator)), search)
     with Sign("", rounds, "rounds") as sign:

@@ -80,8 +80,8 @@ class AvoidanceCost(QuadraticCost):
         self.reach = positive_real("AvoidanceCost", "reach", reach)
         self.kind = choice("AvoidanceCost", "kind", kind, ("penalty", "log"))
         heavy = positive_real("AvoidanceCost", "weight", weight)
-        self.register_buffer("weight", torch.tensor(heavy, dtype=torch.float64, device="cpu"))
-        self.register_buffer("edge", torch.tensor(_EDGE, dtype=torch.float64, device="cpu"))
+        self.register_buffer("weight", self.q.new_tensor(heavy))
+        self.register_buffer("edge", self.q.new_tensor(_EDGE))
         self.weight: Tensor
         self.edge: Tensor
 
@@ -179,7 +179,7 @@ def plan_around(
     ways = problem.levels()
     rows = x0.repeat_interleave(len(ways), dim=0)
     away = (ways - problem.rest).repeat(len(x0), 1)
-    pushed = torch.arange(steps, device="cpu") < steps // 4
+    pushed = torch.arange(steps, device=x0.device) < steps // 4
     control: Tensor = problem.rest + torch.where(pushed[:, None], away.unsqueeze(1), 0.0)
     gains = (-problem.k).expand(len(rows), steps, -1, -1)
     around = Reference(problem.goal.expand(len(rows), steps, -1), gains)

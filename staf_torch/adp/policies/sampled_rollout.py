@@ -16,7 +16,7 @@ from ...lanes import compiled, each, repeat, scan
 from ...lanes.gradients import defer_gradient, marked
 from ...numerics.box import LARGEST, box_minimum
 from ...numerics.checks import fail, integer, positive_real, trailing
-from ...numerics.default_device import beside
+from ...numerics.default_device import beside, device_of
 from ...numerics.kept_precision import KeptPrecision
 from ...systems import Bounds, Plant, StepPlant
 from ...systems.black_box import Numbers
@@ -302,10 +302,10 @@ class FollowedSimulator:
         """The LQR within its bounds, in NumPy."""
         assert isinstance(self.base, LQR)
         cost, size = self.base.cost, self.base.cost.dim
-        columns = np.ascontiguousarray(self.base.k.numpy().T)
-        target = np.zeros(size) if cost.target is None else cost.target.numpy()
-        rest = np.zeros(cost.inputs) if cost.target_input is None else cost.target_input.numpy()
-        low, high = self.bounds.low.numpy(), self.bounds.high.numpy()
+        columns = np.ascontiguousarray(self.base.k.cpu().numpy().T)
+        target = np.zeros(size) if cost.target is None else cost.target.cpu().numpy()
+        rest = np.zeros(cost.inputs) if cost.target_input is None else cost.target_input.cpu().numpy()
+        low, high = self.bounds.low.cpu().numpy(), self.bounds.high.cpu().numpy()
         turn, whole = np.array([2 * np.pi * (k in cost.periodic) for k in range(size)]), 2 * np.pi
 
         def feedback(x: Numbers) -> Numbers:
@@ -320,7 +320,10 @@ class FollowedSimulator:
 
     def _asked(self, x: Numbers) -> Numbers:
         with torch.no_grad():
-            u: Numbers = self.bounds.clip(self.base(torch.from_numpy(x))).numpy()
+            at = torch.from_numpy(x).to(
+                device_of(self.base)
+            )  # a simulator is on the CPU, a policy need not be
+            u: Numbers = self.bounds.clip(self.base(at)).cpu().numpy()
         return u
 
 

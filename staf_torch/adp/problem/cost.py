@@ -24,7 +24,7 @@ from ...numerics.checks import (
     trailing,
     vector,
 )
-from ...numerics.default_device import beside
+from ...numerics.default_device import beside, device_of
 from ...numerics.linalg import Matrix, positive_definite, positive_semidefinite, square
 from ...numerics.row_checks import check_rows
 from ...numerics.shown import limits, shown, sizes
@@ -140,6 +140,8 @@ class Cost(nn.Module, metaclass=OfRows):
         Raises:
             ValueError: if the sizes differ.
         """
+        if self.q.device != (device := device_of(plant)):  # a cost around a plant is where the plant is
+            return copied(self).to(device).around(plant)
         name = type(plant).__name__
         if (plant.dim or self.dim) != self.dim or plant.inputs not in (0, self.inputs):
             raise ValueError(
@@ -160,19 +162,30 @@ class Cost(nn.Module, metaclass=OfRows):
         placed.periodic = plant.periodic
         if self.output is not None and self.periodic != plant.periodic:
             placed._periods = periods_of(self.output, self.dim, plant.periodic)
-        placed.bounds = plant.bounds if self.bounds is None else self.bounds
+        placed.bounds = (
+            self.bounds if plant.bounds is None or self.bounds is not None else plant.bounds.on(device)
+        )
         same = all(getattr(placed, k) is getattr(self, k) for k in ("target", "target_input", "bounds"))
         if same and self.periodic == plant.periodic:
             return self
         placed._prepare()
         return placed
 
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """Move the bounds and the set-point, too: no step of a loop should copy them to its device."""
+        moved: Self = super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
+        device = self.q.device
+        self.bounds = None if self.bounds is None else self.bounds.on(device)
+        self.target = None if self.target is None else self.target.to(device)
+        self.target_input = None if self.target_input is None else self.target_input.to(device)
+        return moved
+
     def bounded(self, low: Limit, high: Limit) -> Self:
         """This cost with other bounds of the inputs; the same where both are None."""
         if low is None and high is None:
             return self
         other = copied(self)
-        other.bounds = Bounds(low, high, self.inputs)
+        other.bounds = Bounds(low, high, self.inputs).on(self.q.device)
         other._prepare()
         return other
 

@@ -90,9 +90,9 @@ def linear_hold(plant: Plant, cost: Cost, period: float) -> Hold:
         ValueError: if the period breaks its rule.
     """
     f, g = (t.double() for t in plant.linearisation(cost.target, cost.target_input))
-    q = cost.state_curvature()
+    q, r = (t.to(f) for t in (cost.state_curvature(), cost.r))
     if plant.period is None:
-        return exact_hold(f, g, q, cost.r, period, discount=cost.discount)
+        return exact_hold(f, g, q, r, period, discount=cost.discount)
     share = math.exp(-0.5 * cost.discount * plant.period)
     z = f.new_zeros(len(f) + g.shape[1], len(f) + g.shape[1])
     z[: len(f), : len(f)], z[: len(f), len(f) :], z[len(f) :, len(f) :] = (
@@ -101,7 +101,7 @@ def linear_hold(plant: Plant, cost: Cost, period: float) -> Hold:
         torch.eye(g.shape[1], dtype=g.dtype, device=g.device),
     )
     flow, paid = torch.eye(len(z), dtype=z.dtype, device=z.device), torch.zeros_like(z)
-    rate = plant.period * torch.block_diag(q.double(), cost.r.double())
+    rate = plant.period * torch.block_diag(q, r)
     for _ in range(periods("linear_hold", plant, period)):
         paid = paid + flow.mT @ rate @ flow
         flow = share * z @ flow
@@ -130,7 +130,7 @@ def held_riccati(plant: Plant, cost: Cost, period: float) -> tuple[Tensor, Tenso
     check_modes(
         rest * f.double(),
         rest * g.double(),
-        cost.state_curvature().double(),
+        cost.state_curvature().to(f).double(),
         name=name,
         discrete=plant.period is not None,
     )

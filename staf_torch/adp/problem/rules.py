@@ -93,6 +93,7 @@ def check_within(call: str, argument: str, bounds: Bounds | None, u: Tensor) -> 
     """
     if bounds is None:
         return
+    bounds = bounds.on(u.device)
     low, high = bounds.low.tolist(), bounds.high.tolist()
     if not bool(bounds.contain(u)):
         rule = f"must hold the plant at the set-point with an input within the bounds, {low} and {high}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
@@ -103,7 +103,7 @@ class SampledProblem(nn.Module):
         device = device_of(goal, rest, step)
         zeros = torch.zeros(self.dim, dtype=torch.float64, device=device)
         none = torch.zeros(self.inputs, dtype=torch.float64, device=device)
-        self.bounds = Bounds(low, high, self.inputs)
+        self.bounds = Bounds(low, high, self.inputs).on(device)
         self.register_buffer("goal", zeros if goal is None else goal.double())
         self.register_buffer("rest", none if rest is None else rest.double())
         self.goal: Tensor
@@ -196,7 +196,7 @@ class SampledProblem(nn.Module):
             high=None if box is None else box.high,
             periodic=plant.periodic,
             goal=plant.equilibrium() if isinstance(cost, TrackingCost) else cost.target,
-            rest=cost.target_input,
+            rest=cost.r.new_zeros(cost.inputs) if cost.target_input is None else cost.target_input,
             path=cost.path if isinstance(cost, TrackingCost) else None,
             terminal=cost.ending if terminal is None else terminal,
         )
@@ -246,6 +246,12 @@ class SampledProblem(nn.Module):
     def admissible(self, u: Tensor) -> Tensor:
         """The nearest control within the bounds: (..., m) -> (..., m)."""
         return self.bounds.clip(u)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """Move the bounds, too."""
+        moved: Self = super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
+        self.bounds = self.bounds.on(self.goal.device)
+        return moved
 
     def levels(self) -> Tensor:
         """Every combination of lower bound, rest and upper bound, where there are bounds: (L, m)."""

@@ -312,7 +312,8 @@ class _Brakes(NamedTuple):
 
 def _reachable(end: Tensor, bounds: Bounds, rest: Tensor) -> Tensor:
     """Bounds in which inputs without one of their own may go far beside the others that have one."""
-    both = torch.cat((bounds.low - rest, bounds.high - rest)).double()
+    bounds = bounds.on(rest.device)
+    end, both = end.to(rest.device), torch.cat((bounds.low - rest, bounds.high - rest)).double()
     known = both[torch.isfinite(both)].abs()
     if not len(known):
         return end.clone()
@@ -324,8 +325,8 @@ def _reachable(end: Tensor, bounds: Bounds, rest: Tensor) -> Tensor:
 def _brakes(of: Conditions, x: Tensor, t: Tensor) -> _Brakes:
     lean, slopes = Lean(*of.every(of.lean, x, t)), of.every(of.level, x, t)[2].sqrt()
     count, fastest = len(of.constraints), 1 / (_PERIODS * of.hold)
-    rest, slope = of.plant.resting_input().to(x), lean.slope
-    own = torch.where(slope > 0, slope * (of.bounds.high - rest), slope * (of.bounds.low - rest))
+    rest, slope, bounds = of.plant.resting_input().to(x), lean.slope, of.bounds.on(x.device)
+    own = torch.where(slope > 0, slope * (bounds.high - rest), slope * (bounds.low - rest))
     sure = torch.where(torch.isfinite(own), own, 0.0).sum(-1)  # of the inputs that have bounds
     constant: list[float | None] = []
     usual: list[float | None] = []
