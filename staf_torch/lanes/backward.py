@@ -174,6 +174,8 @@ class Backward:
 
     def _carries(self, rows: slice, times: slice, begin: Sequence[Tensor], every: int) -> list[Tensor]:
         """The carry before times of some rows, computed again."""
+        if not begin:
+            return []
         row, now = self._some(self._row, rows, None), self._some(self._now, rows, times)
         count, length = rows.stop - rows.start, times.stop - times.start
         given = Given([*begin], now, row, self._call.structures, count, length)

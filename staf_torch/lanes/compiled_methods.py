@@ -24,6 +24,7 @@ from torch.utils import _device
 from ..signs import Sign
 from . import call
 from .call import PlannedCall, at_once, ordinary
+from .call import served as served_by
 from .contents import BOUND, Contents
 from .locks import Mutex
 from .loops import tracing_now
@@ -198,7 +199,7 @@ class CompiledMethod:
         except RuntimeError:  # a nested tensor has no size
             plain = True
         if plain:
-            return self._exported(x, *more) if is_exporting() else self._defined(x, *more)
+            return self._exported(x, *more) if is_exporting() else self._learned(x, *more)
         if self._served is None or _when == "never":
             if not _is_state(x):
                 return self._refused(x, *more)
@@ -209,7 +210,7 @@ class CompiledMethod:
         if read is None or not read.unchanged(library=False):
             read = self._compile(trees=bool(more))
         if read.wants_gradient():  # of what the owner holds
-            return self._defined(x, *more)
+            return self._learned(x, *more)
         if (served := self._served) is None:  # no longer
             self._compile(trees=bool(more))
             served = self._served
@@ -228,6 +229,25 @@ class CompiledMethod:
             self._refused(x)
             raise
         return y.view(-1) if dims == 1 else y.reshape(*x.shape[:-1], y.shape[-1])
+
+    def _learned(self, x: Tensor, *more: Tree) -> Any:
+        """Compute what may have a gradient: by the program that serves, if one does, or the definition."""
+        program: Program | None = getattr(self._served, "program", None)
+        given = flatten((x, *more))[0]
+        usable = _when != "never" and torch.is_grad_enabled() and isinstance(x, Tensor) and not tracing_now()
+        if program is None or not usable or x.is_nested or not x.numel() or not served_by(given):
+            return self._defined(x, *more)
+        if self._read is None or not self._read.unchanged(library=False):
+            self._compile(trees=bool(more))
+            return self._learned(x, *more)
+        if more:
+            leaves, structure = flatten(program((), (), (x, *more), steps=1)[1])
+            return unflatten(structure, iter([leaf[:, 0] for leaf in leaves]))
+        if not _is_state(x):
+            return self._refused(x)
+        with points_of_rows(len(x), x.shape[1:-1].numel()) if x.dim() > 2 else contextlib.nullcontext():
+            y: Tensor = program((), (), (x.reshape(-1, x.shape[-1]),), steps=1)[1]
+        return y.reshape(*x.shape[:-1], y.shape[-1])
 
     def _exported(self, x: Tensor, *more: Tree) -> Any:
         """Compute by the definition for `torch.export`, which has no words for what it does not take."""
@@ -304,20 +324,19 @@ class CompiledMethod:
         self._asked, self.waits = math.inf, True
 
     def _compile(self, trees: bool) -> Contents:
-        """Make what serves, unless a gradient by something that the owner holds is wanted now."""
+        """Make what serves, unless that is made in a way of its own and a gradient by the owner is wanted."""
         with self._lock:
             if self._served is not None and self._read is not None and self._read.unchanged(library=False):
                 return self._read  # another thread has
             settings, read = self._settings, Contents(self.definition, self.owner)
             read.warn(settings.name)
             served: Served | None = None
-            if not read.wants_gradient():
-                if settings.by is not None:
-                    served = settings.by(self.owner)
-                else:
-                    made = self.definition, settings.name, self.definition, self.owner
-                    rows = Rows(*made, copies=settings.copies)
-                    served = _Trees(rows) if trees else rows
+            if settings.by is None:
+                made = self.definition, settings.name, self.definition, self.owner
+                rows = Rows(*made, copies=settings.copies)
+                served = _Trees(rows) if trees else rows
+            elif not read.wants_gradient():
+                served = settings.by(self.owner)
             self._at_once = {} if served is None else served.at_once
             self._served, self._read = served, read
             return read
@@ -438,10 +457,10 @@ class _Trees:
     """The variant of `Rows` that maps trees (B, ...) to trees (B, ...)."""
 
     def __init__(self, rows: Rows) -> None:
-        self._program, self.compiled = rows.program, False
+        self.program, self.compiled = rows.program, False
         self.at_once: dict[Any, Callable[[Tensor], Tensor]] = {}
 
     def __call__(self, *given: Tree) -> Tree:
-        self.compiled = self.compiled or self._program.compiles((), (), given, steps=1)
-        leaves, structure = flatten(self._program((), (), given, steps=1)[1])
+        self.compiled = self.compiled or self.program.compiles((), (), given, steps=1)
+        leaves, structure = flatten(self.program((), (), given, steps=1)[1])
         return unflatten(structure, iter([leaf[:, 0] for leaf in leaves]))

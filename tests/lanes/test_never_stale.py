@@ -235,12 +235,12 @@ def test_a_module_is_computed_as_it_is_at_the_moment(part: str) -> None:
     assert kept.unchanged(module) is again
 
 
-def test_where_a_derivative_may_be_wanted_there_is_no_program(notebook: Any) -> None:
+def test_where_a_derivative_is_wanted_the_program_has_it(notebook: Any) -> None:
     kept, function = SharedPrograms("a test"), notebook.FUNCTIONS["tensor"]
     for _ in range(3):
         assert of(kept, function).compile
     notebook.tensor.requires_grad_()
-    assert not of(kept, function).compile
+    assert of(kept, function)(X, steps=1)[1].requires_grad
     with torch.no_grad():
         assert of(kept, function).compile
 

@@ -1,0 +1,182 @@
+"""A program's gradient is that of its definition, whatever it is by, in any memory, on any threads."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from helpers import tensor, uniform
+from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
+
+from staf_torch import lanes
+from staf_torch.lanes import Shared
+from staf_torch.lanes.tree import Tree, flatten, plain
+
+pytestmark = pytest.mark.needs_compiler
+ROWS, TIMES = 70, 13
+GAIN, MATRIX = nn.Parameter(tensor(0.3)), nn.Parameter(tensor([[0.4, -0.2, 0.1], [0.3, 0.2, -0.5]]))
+
+
+def drawn(*shape: int) -> Tensor:
+    return uniform(math.prod(shape)).reshape(shape)
+
+
+OWN = torch.linspace(0.5, 1.5, ROWS).double().requires_grad_()
+NUMBERS = lanes.rows(OWN)
+
+
+def everything(carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
+    """A step that reads inputs of all kinds, tensors of outside, and counts."""
+    (x, count), (u, wind), (mass, push) = carry, now, row
+    turned = (x @ MATRIX.mT).tanh()
+    after = x + 0.1 * torch.cat((turned, u), -1) / mass.unsqueeze(-1) - GAIN * NUMBERS * x.sin() * wind
+    return (after + push, count + 1), {"turned": turned, "far": x.norm(dim=-1), "count": count}
+
+
+def inputs() -> tuple[Tree, Tree, Tree]:
+    x, u, mass = drawn(ROWS, 3), drawn(ROWS, TIMES, 1), drawn(ROWS).abs() + 1
+    wind, push = drawn(TIMES), drawn(3)
+    for part in (x, u, mass, wind, push):
+        part.requires_grad_()
+    return (x, torch.zeros(ROWS, dtype=torch.int64)), (u, Shared(wind)), (mass, Shared(push))
+
+
+EVERYTHING = lanes.Program(everything)
+
+
+def gradients(
+    function: Callable[..., Tree], given: tuple[Tree, ...], *more: Tensor, **settings: Any
+) -> list[Tensor]:
+    found = [leaf for leaf in flatten(function(*given, **settings))[0] if leaf.is_floating_point()]
+    weights = [torch.linspace(0.5, 1.0, leaf.numel()).to(leaf).view(leaf.shape) for leaf in found]
+    total = sum((leaf * weight).sum() for leaf, weight in zip(found, weights, strict=True))
+    by = [leaf for leaf in map(plain, flatten(given)[0]) if leaf.requires_grad]
+    return [*torch.autograd.grad(total, [*by, *more])]
+
+
+def close(found: list[Tensor], wanted: list[Tensor], tolerance: float = 1e-11) -> None:
+    for one, other in zip(found, wanted, strict=True):
+        assert one.shape == other.shape
+        assert one.dtype == other.dtype
+        torch.testing.assert_close(one, other, rtol=tolerance, atol=tolerance * float(other.abs().max()))
+
+
+@pytest.mark.parametrize("mebibytes", [256, 0.02, 0.001])
+@pytest.mark.parametrize("every", [1, 4])
+def test_a_gradient_is_that_of_the_definition_by_all_that_is_read(every: int, mebibytes: float) -> None:
+    given = inputs()
+    wanted = gradients(EVERYTHING.definition, given, GAIN, MATRIX, OWN, every=every)
+    with lanes.gradient_memory(mebibytes):
+        close(gradients(EVERYTHING, given, GAIN, MATRIX, OWN, every=every), wanted)
+
+
+def test_on_a_device_it_is_the_same() -> None:
+    given = inputs()
+    with lanes.device.host():
+        found = gradients(EVERYTHING, given, GAIN, MATRIX, OWN)
+    close(found, gradients(EVERYTHING, given, GAIN, MATRIX, OWN))
+
+
+def test_it_has_the_same_bits_on_any_threads_and_a_nan_stays_in_its_row() -> None:
+    threads, given = torch.get_num_threads(), inputs()
+    first = gradients(EVERYTHING, given, GAIN, MATRIX, OWN)
+    try:
+        torch.set_num_threads(1 if threads > 1 else 2)
+        for one, other in zip(first, gradients(EVERYTHING, given, GAIN, MATRIX, OWN), strict=True):
+            assert torch.equal(one, other)
+    finally:
+        torch.set_num_threads(threads)
+    (x, count), now, row = given
+    broken = x.detach().clone()
+    broken[5] = math.nan
+    beside = gradients(EVERYTHING, ((broken.requires_grad_(), count), now, row))
+    for one, other in zip((beside[k] for k in (0, 1, 3)), (first[k] for k in (0, 1, 3)), strict=True):
+        assert torch.equal(one[6:], other[6:])
+        assert torch.equal(one[:5], other[:5])
+        assert one[5].isnan().any()
+
+
+def test_numbers_that_are_learned_are_read_anew_and_nothing_is_traced_again() -> None:
+    calls, gain = list[int](), nn.Parameter(tensor(0.5))
+
+    def step(x: Tensor, _: Tree, __: Tree) -> tuple[Tensor, Tensor]:
+        calls.append(len(x))
+        return x - gain * x.sin(), x
+
+    program, x = lanes.Program(step), drawn(4)
+    optimizer, found = torch.optim.SGD([gain], 0.1), list[Tensor]()
+    for _ in range(3):
+        optimizer.zero_grad()
+        program(x, steps=5)[1].square().mean().backward()
+        found.append(gain.grad.clone())  # type: ignore[union-attr]
+        count = len(calls)
+        wanted = torch.autograd.grad(program.definition(x, steps=5)[1].square().mean(), gain)[0]
+        torch.testing.assert_close(found[-1], wanted, rtol=1e-12, atol=1e-13)
+        assert len(found) == 1 or len(calls) == count + 5  # of the definition
+        calls.clear()
+        optimizer.step()
+    assert len({float(each) for each in found}) == 3
+    late = program(x, steps=5)[1].sum()
+    with torch.no_grad():
+        gain.mul_(2)
+    with pytest.raises(RuntimeError, match="inplace operation"):
+        late.backward()
+
+
+def test_where_nobody_asks_for_it_there_is_none_and_a_checkpoint_has_it() -> None:
+    given = inputs()
+    with torch.no_grad():
+        assert not EVERYTHING(*given)[0][0].requires_grad
+    with torch.inference_mode():
+        assert not EVERYTHING(*given)[0][0].requires_grad
+    x = given[0][0]
+    again = checkpoint(lambda at: EVERYTHING((at, given[0][1]), *given[1:])[0][0], x, use_reentrant=False)
+    (found,) = torch.autograd.grad(again.sum(), x)
+    torch.testing.assert_close(found, torch.autograd.grad(EVERYTHING(*given)[0][0].sum(), x)[0])
+
+
+def test_derivatives_of_derivatives_and_transforms_are_those_of_the_definition(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    (x, count), now, row = inputs()
+
+    def twice(function: Callable[..., Tree]) -> Tensor:
+        energy = function((x, count), now, row)[0][0].square().sum()
+        (slope,) = torch.autograd.grad(energy, x, create_graph=True)
+        return torch.autograd.grad(slope.square().sum(), MATRIX)[0]
+
+    torch.testing.assert_close(twice(EVERYTHING), twice(EVERYTHING.definition), rtol=1e-10, atol=1e-10)
+    assert "a derivative of a derivative is wanted" in caplog.text
+    pushed = functools.partial(EVERYTHING, now=now, row=row)
+    energy = lambda at: pushed((at, count))[0][0].square().sum()  # noqa: E731
+    torch.testing.assert_close(torch.func.grad(energy)(x.detach()), torch.autograd.grad(energy(x), x)[0])
+
+
+def corners(x: Tensor, u: Tensor, _: Tree) -> tuple[Tensor, Tree]:
+    """What has no derivative everywhere: as torch has it, ties and corners too."""
+    x = torch.where(x > 0, x * u, x - u).clamp(-1.5, 1.5)
+    far, near = torch.maximum(x, u), torch.minimum(x.abs(), u)
+    return far - near, (x.amax(-1), torch.relu(x), (x * x).sum(-1).sqrt(), x.sort(-1).values)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_corners_and_ties_are_torchs(dtype: torch.dtype) -> None:
+    x = tensor([[0.0, 0.0, 1.5], [1.0, 1.0, 1.0], [-2.0, 0.5, 0.5], [0.3, -0.7, 0.2]]).to(dtype)
+    u = tensor([[[0.0, 1.0, 0.5], [1.0, 1.0, 1.0]]]).to(dtype).repeat(4, 1, 1)
+    given = x.requires_grad_(), u.requires_grad_()
+    program = lanes.Program(corners)
+    tolerance = 1e-12 if dtype == torch.float64 else 1e-5
+    found, wanted = gradients(program, given), gradients(program.definition, given)
+    for one, other in zip(found, wanted, strict=True):
+        torch.testing.assert_close(one, other, rtol=tolerance, atol=tolerance, equal_nan=True)
+
+
+def test_a_budget_that_is_none_is_refused() -> None:
+    told = r"gradient_memory\(mebibytes=...\)` must be positive; got 0"
+    with pytest.raises(ValueError, match=told), lanes.gradient_memory(0):
+        pass
