@@ -261,13 +261,15 @@ class _Merge:
         return self._made[key]
 
     def _tensor(self, values: list[Any], name: str) -> Any:
+        if any(isinstance(value, RowNumbers) for value in values):  # of which each has its own row
+            values = [v.full[k] if isinstance(v, RowNumbers) else v for k, v in enumerate(values)]
         first = values[0]
         alike = all(
             isinstance(v, Tensor) and v.shape == first.shape and v.dtype == first.dtype for v in values
         )
         if not alike:
             raise self._differ([tuple(v.shape) if isinstance(v, Tensor) else v for v in values], name)
-        if all(not isinstance(v, RowNumbers) and torch.equal(v, first) for v in values):
+        if all(torch.equal(v, first) for v in values):
             return first
         if not first.is_floating_point():
             raise self._differ(values, name)
