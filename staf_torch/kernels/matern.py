@@ -39,6 +39,8 @@ class MaternKernel(RadialKernel):
         ValueError: for another smoothness, or a length scale that is not positive and finite.
     """
 
+    told = ()  # the smoothness decides which polynomial
+
     def __init__(self, smoothness: float = 2.5, length_scale: float | Tensor = 1.0) -> None:
         super().__init__(length_scale)
         choice("MaternKernel", "smoothness", smoothness, tuple(_POLYNOMIALS))

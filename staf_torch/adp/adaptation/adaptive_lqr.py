@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ...lanes.row_numbers import nonzero
 from ...numerics.checks import fail, non_negative, positive_real, real, trailing
 from ...numerics.riccati import product
 from ...numerics.rows import chosen
@@ -145,7 +146,7 @@ class AdaptiveLQR(Controller):
             x, missing = torch.where(missing, belief.mean, x), torch.zeros_like(missing)
         u = self._control(x if belief is None else belief.mean, estimate.theta, p, k)
         doubtful = self.robust(x)
-        if self.probe:
+        if nonzero(self.probe):
             doubtful = doubtful + self._probing(now.time)
         # What the actuator will give, which the window must know.
         u = self.cost.admissible(torch.where(certain.unsqueeze(-1), u, doubtful))

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ...kernels import Kernel
+from ...lanes.row_numbers import nonzero
 from ...lanes.row_objects import OfRows
 from ...numerics.checks import fail, non_negative, positive_real, real, trailing
 from ...numerics.default_device import device_of
@@ -150,7 +151,7 @@ class StreamDrift(metaclass=OfRows):
         """
         mean, p, ready = estimate.mean, estimate.covariance, equation.ready
         scale, x = self.deviation, torch.where(ready.unsqueeze(-1), x, estimate.anchor)
-        if self.forgetting:
+        if nonzero(self.forgetting):
             identity = torch.eye(p.shape[-1], dtype=p.dtype, device=p.device)
             p = identity + (p - identity) / (1 + self.forgetting * dt)
         s = scale * equation.s[..., 0, :]

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ...lanes.row_numbers import nonzero
 from ...lanes.row_objects import OfRows
 from ...numerics.checks import non_negative, one_or_each, positive, positive_real, real, vector
 from ...numerics.riccati import measured
@@ -106,7 +107,7 @@ class LeastSquares(metaclass=OfRows):
         missed = torch.zeros_like(state.resets) if state.missed is None else state.missed
         missed = missed + (ready & ~fine.all(-1)).to(missed)
         prior = self.prior.to(theta)
-        if self.forgetting:
+        if nonzero(self.forgetting):
             grown = p * (1 + self.forgetting * dt)
             room = grown.diagonal(dim1=-2, dim2=-1).sum(-1) <= prior.diagonal().sum()
             p = torch.where(room[..., None, None], grown, p)

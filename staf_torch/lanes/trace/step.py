@@ -7,6 +7,7 @@ library's (`factorisations`, `eigenvalues`, `decompositions`), else torch's own 
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
 from collections.abc import Callable, Sequence
@@ -114,8 +115,9 @@ def trace(step: Step, given: Given, *, widened: bool = False, folded: bool = Fal
             if folded:
                 raise NotLoweredError("it reads numbers of a row's own, of which this form has no column")
             if id(numbers) not in own:
-                slot, like = len(given.row) + len(own), numbers.full[:1]
-                own[id(numbers)] = numbers, tracer.input(like, "row", slot)[0]
+                with _outside_transforms():  # met first in a derivative, say
+                    found = tracer.input(numbers.full[:1], "row", len(given.row) + len(own))[0]
+                own[id(numbers)] = numbers, found
             return own[id(numbers)][1]
 
         with tracer, tracing(tracer), resolving(one), _TorchFunctions(tracer):
@@ -211,6 +213,15 @@ class _TorchFunctions(TorchFunctionMode):
         if name == "__bool__" and args[0].is_floating_point():  # other numbers may be as true as this
             return bool(args[0] != 0)
         return func(*args, **kwargs)
+
+
+def _outside_transforms() -> Any:
+    """Context in which no derivative of `torch.func` is taken."""
+    if torch._C._functorch.peek_interpreter_stack() is None:
+        return contextlib.nullcontext()
+    from torch._functorch.pyfunctorch import temporarily_clear_interpreter_stack
+
+    return temporarily_clear_interpreter_stack()
 
 
 def _stacked(parts: Any) -> Tensor:
