@@ -12,7 +12,8 @@ import torch
 from torch import Tensor, nn
 
 import staf_torch as st
-from staf_torch import adp, lanes, online, optim, systems, targets
+from staf_torch import adp, envs, lanes, metrics, online, optim, systems, targets
+from staf_torch.centers import Radius
 
 X = torch.tensor([[0.25, 0.125], [-0.25, 0.5], [1.0, -1.0]], dtype=torch.float64)  # exact in float32
 PLANT = systems.Pendulum()
@@ -78,6 +79,22 @@ def test_what_is_no_state_is_refused_by_argument_and_what_to_write(door: str) ->
             DOORS[door](given)
         assert str(caught.value).startswith("`"), kind
         assert "=...)`" in str(caught.value), kind
+
+
+NUMBERS = ("integers", "flags", "complex", "an array", "a list", "nothing")
+
+
+@pytest.mark.parametrize("kind", NUMBERS)
+def test_plants_and_kernels_take_floating_point_tensors_alone(kind: str) -> None:
+    given, message = REFUSED[kind]
+    plants = PLANT, CART, systems.TwoState(), systems.CartPole(), systems.ThreeState()
+    for door in (
+        *(plant.drift for plant in plants),
+        lambda x: BASIS.kernel(x, X),
+        lambda x: BASIS.kernel(X, x),
+    ):
+        with pytest.raises(ValueError, match=message):
+            door(given)
 
 
 @pytest.mark.compiled
@@ -176,7 +193,45 @@ def own(rows: int) -> Callable[[Tensor], Tensor]:
     return lambda x: numbers * x.square().sum(-1)
 
 
+class Flat(Radius):
+    def forward(self, x: Tensor) -> Tensor:
+        return 0.1 * (x.norm() if len(x) == 1 else x.abs())
+
+
+class Whole(Radius):
+    def forward(self, x: Tensor) -> Tensor:
+        return 0.1 * x.norm()
+
+
+class Turned(st.GaussianKernel):
+    def forward(self, x1: Tensor, x2: Tensor) -> Tensor:
+        return super().forward(x1, x2).mT
+
+
+class Gained(st.GaussianKernel):
+    def log_gain(self, x: Tensor) -> Tensor:
+        return x
+
+
+class Mixed(optim.SteepestDescent):
+    def step(self, objective: Any, weights: Tensor, state: Any) -> Any:
+        return weights + 0.1 * objective.descent(weights).mT, state
+
+
+class Sideways(metrics.Metric):
+    name = "sideways"
+
+    def __call__(self, result: Any, problem: Any) -> Tensor:
+        return result.estimate.mT  # type: ignore[no-any-return]
+
+
+class Rest(Own):
+    def drift(self, x: Tensor) -> Tensor:
+        return super().drift(x).T
+
+
 PAID = r"`Paid.state_rate` must map rows \(5, 2\) to \(5,\), .* as a tensor; got 0.0"
+EPISODE = {"dt": 0.05, "horizon": 1.0, "limit": 9.0, "penalty": 1.0}
 SIX = torch.rand(6, 4, 2, dtype=torch.float64)
 
 
@@ -196,6 +251,13 @@ SIX = torch.rand(6, 4, 2, dtype=torch.float64)
         (lambda: adp.simulate(lambda x: x, CART, COST, X, dt=0.05, steps=2), r"to controls \(3, 1\)"),
         (lambda: st.chase(SIX, BASIS, lambda x: x[..., 0] > 0, LAW), "floating point; got torch.bool"),
         (lambda: BASIS.ideal_weights(X, lambda x: torch.complex(x, x)[..., 0]), "got torch.complex128"),
+        (lambda: st.StateFollowingCenters(st.rings(6), Flat()), r"`Flat` must map rows \(5, 2\) to \(5,\)"),
+        (lambda: st.StateFollowingCenters(st.rings(6), Whole()), "`Whole` must map each state by itself"),
+        (lambda: st.StaFBasis(Turned(), BASIS.centers), "`Turned.forward` must map"),
+        (lambda: st.StaFBasis(Gained(), BASIS.centers), "`Gained.log_gain` must map"),
+        (lambda: st.chase(SIX, BASIS, square, Mixed()), "`Mixed.step` must map"),
+        (lambda: Sideways().badness(st.chase(SIX[:4], BASIS, square, LAW), None), "`Sideways` must map"),
+        (lambda: envs.Episodes(Rest(SIX[0, 0, 0]), COST, 2, **EPISODE), "`Rest.drift` must map"),
         (lambda: torch.func.vmap(lambda s: st.chase(s, BASIS, square, LAW).estimate)(SIX[None]), "all rows"),
     ],
 )

@@ -15,6 +15,7 @@ from ..lanes.row_numbers import over_rows
 from ..lanes.row_objects import Rowwise
 from ..local_basis import Degrees, LocalBasis, LocalSpace
 from ..numerics.checks import learns, sampled, trailing, values_of
+from ..numerics.row_checks import check_kernel
 from .coefficient_format import compare, decode, encode, record
 
 Target = Callable[[Tensor], Tensor]
@@ -104,6 +105,7 @@ class StaFBasis(nn.Module, metaclass=Rowwise):
                 f"{type(kernel).__name__}({kernel.extra_repr()}) over R^{centers.dim} has "
                 f"{rank} dimensions: use at most {rank} centers, or a higher degree."
             )
+        check_kernel(kernel, centers.directions)
         self.kernel = kernel
         self.centers = centers
         self._local_basis = LocalBasis(kernel, centers.directions)

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from ..lanes.row_objects import OfRows
 from ..numerics.checks import fail, hold, kept, non_negative, positive, shown, trailing, values_of
+from ..numerics.row_checks import check_radius
 
 
 class Radius(nn.Module, metaclass=OfRows):
@@ -137,6 +138,7 @@ class StateFollowingCenters(nn.Module, metaclass=OfRows):
         if not isinstance(
             self.radius, ConstantRadius | StateRadius
         ):  # a user's: those two check what they hold
+            check_radius(self.radius, self.directions)
             self.radius.register_forward_hook(_not_negative)
 
     @property

@@ -10,8 +10,9 @@ from torch import Tensor
 from ..approximation.basis import StaFBasis, Target
 from ..lanes import each
 from ..numerics.checks import fail, integer, sampled, trailing
-from ..numerics.row_checks import check_target
+from ..numerics.row_checks import check_law, check_target
 from ..optim.base import LawState, UpdateLaw
+from ..optim.objective import NativeError
 from .predictors import Predictor
 
 _TOGETHER = 10  # centers at which V is written out one by one
@@ -61,6 +62,8 @@ class Problem:
         if directions.is_meta:
             raise fail(self.call, "basis", "must have its values: it was built on the meta device", None)
         check_target(self.target, states, sizes=directions.shape)
+        if len(states) in directions.shape:  # a shape alone says nothing then
+            check_law(self.law, NativeError, directions.new_zeros(len(directions)))
 
     def values(self, x: Tensor) -> Tensor:
         """Return V(c(x)) at the states x (..., n): (..., M)."""

@@ -17,6 +17,7 @@ from ..adp import Controller, Cost, Feedback, QuadraticCost
 from ..adp.loop.controller import Carried, Policy
 from ..adp.loop.simulation import uniform_numbers
 from ..adp.loop.step import ClosedLoop, LoopState
+from ..adp.problem.shapes import check_problem
 from ..lanes.gradients import refuse_gradient
 from ..numerics.checks import choice, fail, positive_real
 from ..systems import Bounds, ControlAffineSystem, Plant
@@ -162,6 +163,7 @@ class Episodes:
         penalty: float,
     ) -> None:
         positive_real("Episodes", "horizon", horizon)
+        check_problem(system, cost)
         self.loop = ClosedLoop(_HeldControl(), system, cost, dt=dt, limit=limit)
         self.steps = math.ceil(horizon / self.loop.dt - 1e-9)
         self.penalty = positive_real("Episodes", "penalty", penalty)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import abc
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from ..lanes.row_objects import OfRows
-from ..numerics.checks import shown
+from ..numerics.checks import shown, states
 
 
 class Kernel(nn.Module, metaclass=OfRows):
@@ -45,6 +45,9 @@ class Kernel(nn.Module, metaclass=OfRows):
     state_free: bool = False
     scale_slope: float | None = None
     """q where s(x, z) = q x'z plus a function of z alone, None where s has another form."""
+
+    def __call__(self, x1: Tensor, x2: Tensor) -> Any:
+        return super().__call__(states(self, "x1", x1), states(self, "x2", x2))
 
     @abc.abstractmethod
     def forward(self, x1: Tensor, x2: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..numerics.row_checks import check_metric
 from ..results.metric_info import MetricInfo
 
 __all__ = ["Metric", "MetricInfo"]
@@ -63,6 +64,7 @@ class Metric(abc.ABC):
         Raises:
             ValueError: if the metric returned another shape.
         """
+        check_metric(self, result, problem)
         values = self(result, problem)
         wanted = tuple(result.state.shape[:2])
         if not isinstance(values, Tensor) or tuple(values.shape) != wanted:

@@ -99,6 +99,8 @@ def own_number(call: str, name: str, value: object, sign: str = "any") -> Any:
         value: a number, or a tensor without dimensions.
         sign: ``positive``, ``not negative`` or ``any``.
     """
+    if type(value) is float and 0 < value < math.inf:
+        return value
     checked = number(call, name, value)
     if isinstance(checked, Tensor) and checked.dim():
         raise fail(call, name, "must be one number, or one a row by `rows`", value)
@@ -231,6 +233,21 @@ def trailing(
         got = show(value)
         got = got if len(got) <= 80 else f"a {type(value).__name__}"
     raise ValueError(f"`{call}({name}=...)` must be a tensor, as by `{write}`; got {got}.")
+
+
+def states(holder: object, name: str, x: Tensor, last: int | None = None) -> Tensor:
+    """Return states that are floating-point numbers, refused by `trailing` otherwise; for methods that are
+    called at every stage of a step.
+
+    Args:
+        holder: whose class is the door.
+        name: of the argument.
+        x: what was given.
+        last: as in `trailing`.
+    """
+    if type(x) is Tensor and x.dtype in _FLOATS:
+        return x
+    return trailing(type(holder).__name__, name, x, 1, last)
 
 
 def _not_dense(call: str, name: str, value: Tensor) -> ValueError:

@@ -6,6 +6,7 @@ right shape and wrong numbers. So it is called with other numbers of rows, and i
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import weakref
 from collections.abc import Callable, Collection, Hashable, Sequence
@@ -29,7 +30,8 @@ def row_counts(sizes: Collection[int]) -> tuple[int, int]:
 
 def is_ours(function: object) -> bool:
     """Return whether a function is of this library, and has shapes that the tests know."""
-    return str(getattr(getattr(function, "func", function), "__module__", "")).startswith("staf_torch.")
+    function = getattr(function, "__func__", getattr(function, "func", function))
+    return str(getattr(function, "__module__", "")).startswith("staf_torch.")
 
 
 def check_rows(
@@ -122,3 +124,122 @@ def check_target(
         check_rows(name, target, [x.reshape(-1, x.shape[-1])[0]], inner, sizes=(*sizes, *x.shape), rule=rule)
 
     once(target, (x.shape[-1], outputs), check)
+
+
+def check_radius(radius: Callable[[Tensor], Any], directions: Tensor) -> None:
+    """Refuse a radius of a user that is not one number a state, or one for all states, whatever their number.
+
+    Args:
+        radius: nu, of states (..., n).
+        directions: (M, n), of its centers.
+    """
+    if is_ours(type(radius)) or directions.is_meta:
+        return
+
+    def of_rows(x: Tensor) -> Any:
+        found = radius(x)
+        return found.expand(len(x)) if isinstance(found, Tensor) and found.dim() == 0 else found
+
+    def check() -> None:
+        x, name = _somewhere(directions, directions.shape[1]), type(radius).__name__
+        check_rows(name, of_rows, [x], sizes=directions.shape)
+        with torch.no_grad():
+            found = [of_rows(x.repeat(count, 1))[0] for count in row_counts(directions.shape)]
+        if not torch.allclose(*found, rtol=1e-6, equal_nan=True):
+            raise ValueError(f"`{name}` must map each state by itself; nu depends on how many there are.")
+
+    once(radius, ("radius", directions.shape), check)
+
+
+def check_kernel(kernel: Any, directions: Tensor) -> None:
+    """Refuse a kernel of a user, or a closed form of it, that does not return its shape in every row.
+
+    Args:
+        kernel: k, with the methods of `kernels.Kernel`.
+        directions: (M, n), of its centers.
+    """
+    if is_ours(type(kernel)) or directions.is_meta:
+        return
+
+    def check() -> None:
+        n, name = directions.shape[1], type(kernel).__name__
+        few, many = [size for size in (2, 3, 4) if size != n][:2]
+        x, y, c, b = (_somewhere(directions, *shape) for shape in ((n,), (few, n), (many, n), (many,)))
+        check_rows(f"{name}.forward", kernel, [y, c], (few, many), sizes=directions.shape)
+        forms = {"gradient": ([y, c, b], (few, n)), "core": ([x, y, c], (few, many))}
+        forms |= {"log_gain": ([x], ()), "log_scale": ([x, y], (few,))}
+        for form, (given, inner) in forms.items():
+            method = getattr(kernel, form)
+            if not is_ours(method) and method(*given) is not None:
+                check_rows(f"{name}.{form}", method, given, inner, sizes=directions.shape)
+
+    once(kernel, ("kernel", directions.shape), check)
+
+
+def check_law(law: Any, objective: Callable[[Tensor, Tensor], Any], row: Tensor) -> None:
+    """Refuse a law of a user that does not return weights and a state of every row.
+
+    Args:
+        law: with the methods of `optim.UpdateLaw`.
+        objective: makes one of Gram matrices (R, M, M) and values (R, M).
+        row: zeros (M,).
+    """
+    if is_ours(type(law)):
+        return
+    count, name = len(row), type(law).__name__
+
+    def stepped(rows: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
+        given = objective(
+            torch.eye(count, dtype=rows.dtype, device=rows.device).expand(len(rows), -1, -1),
+            torch.ones_like(rows),
+        )
+        moved: tuple[Tensor, tuple[Tensor, ...]] = law.step(
+            given, rows, law.begin(given, rows, law.init(rows))
+        )
+        return moved
+
+    def check() -> None:
+        check_rows(f"{name}.step", lambda rows: stepped(rows)[0], [row], (count,))
+        for k, part in enumerate(law.init(row.expand(1, -1))):
+            if part.is_floating_point():
+                what = f"{name}.step(...)[1][{k}]"
+                check_rows(what, lambda rows, k=k: stepped(rows)[1][k], [row], tuple(part.shape[1:]))
+
+    once(law, ("law", count, row.dtype), check)
+
+
+def check_metric(metric: Callable[[Any, Any], Any], result: Any, problem: Any) -> None:
+    """Refuse a metric of a user that does not return one number a time of every row, where the number of rows
+    is also another size of the result, and its shape alone says nothing.
+
+    Args:
+        metric: of a result and its problem, to (B, T).
+        result: a dataclass of tensors (B, ...), ``time`` (T,), and dictionaries of such.
+        problem: as it is.
+    """
+    batch, times = result.state.shape[:2]
+    parts = {f.name: getattr(result, f.name) for f in dataclasses.fields(result) if f.name != "time"}
+    known = {size for part in parts.values() if isinstance(part, Tensor) for size in part.shape[1:]}
+    if is_ours(type(metric)) or batch not in known:
+        return
+
+    def of_rows(count: int, part: Any) -> Any:
+        if isinstance(part, dict):
+            return {name: of_rows(count, inner) for name, inner in part.items()}
+        own = isinstance(part, Tensor) and part.dim() > 0 and len(part) == batch
+        return part[:1].expand(count, *part.shape[1:]) if own else part
+
+    def some(rows: Tensor) -> Any:
+        fewer = {name: of_rows(len(rows), part) for name, part in parts.items()}
+        return metric(dataclasses.replace(result, **fewer), problem)
+
+    def check() -> None:
+        check_rows(type(metric).__name__, some, [result.state[0, 0]], (times,), sizes=known)
+
+    once(metric, ("metric", result.state.shape[1:]), check)
+
+
+def _somewhere(like: Tensor, *shape: int) -> Tensor:
+    """Return points without a pattern, of the dtype and device of a tensor."""
+    numbers = torch.arange(1.0, 1.0 + torch.Size(shape).numel(), dtype=like.dtype, device=like.device)
+    return (0.7 * numbers).cos().reshape(shape)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..numerics.angles import wrap
-from ..numerics.checks import fail, hold, numbers_of
+from ..numerics.checks import fail, hold, numbers_of, states
 from .base import ControlAffineSystem, Linearisation, Units
 
 Wall = float | Sequence[float | None] | Tensor | None
@@ -148,7 +148,7 @@ class Barrier(ControlAffineSystem):
         return torch.where(self.free, 1.0, whole.square() / ((below + above) * small))
 
     def drift(self, s: Tensor) -> Tensor:
-        return self.stretch(s) * self.plant.drift(self.inverse(s))
+        return self.stretch(states(self, "s", s, self.dim)) * self.plant.drift(self.inverse(s))
 
     def smooth_drift(self, s: Tensor) -> Tensor:
         return self.stretch(s) * self.plant.smooth_drift(self.inverse(s))

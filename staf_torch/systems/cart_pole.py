@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..numerics.checks import keep, own_number
+from ..numerics.checks import keep, own_number, states
 from .base import ControlAffineSystem, Number, Units
 
 
@@ -52,7 +52,7 @@ class CartPole(ControlAffineSystem):
         self.gravity = keep(self, "gravity", own_number("CartPole", "gravity", gravity, "positive"))
 
     def drift(self, x: Tensor) -> Tensor:
-        _, angle, speed, turning = x.unbind(-1)
+        _, angle, speed, turning = states(self, "x", x, 4).unbind(-1)
         lever = self.pole * self.half_length / self.total
         shift = lever * turning.square() * angle.sin()
         bend = (self.gravity * angle.sin() - angle.cos() * shift) / self._reach(angle)

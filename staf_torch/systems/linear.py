@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..lanes.row_numbers import RowNumbers
-from ..numerics.checks import fail, hold, number, numbers_of, vector
+from ..numerics.checks import fail, hold, number, numbers_of, states, vector
 from ..numerics.linalg import exponential, riccati
 from .base import ControlAffineSystem
 
@@ -46,7 +46,7 @@ class Linear(ControlAffineSystem):
         self.inputs = self.input_matrix.shape[1]
 
     def drift(self, x: Tensor) -> Tensor:
-        return x @ self.matrix.to(x).mT
+        return states(self, "x", x, self.dim) @ self.matrix.to(x).mT
 
     def effectiveness(self, x: Tensor) -> Tensor:
         return self.input_matrix.to(x).expand(*x.shape, self.inputs)

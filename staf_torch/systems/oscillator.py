@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..numerics.checks import keep, own_number
+from ..numerics.checks import keep, own_number, states
 from .base import ControlAffineSystem, Number
 
 
@@ -36,7 +36,7 @@ class Oscillator(ControlAffineSystem):
         self.frequency = keep(self, "frequency", own_number("Oscillator", "frequency", frequency, "positive"))
 
     def drift(self, x: Tensor) -> Tensor:
-        x1, x2 = x.unbind(-1)
+        x1, x2 = states(self, "x", x, 2).unbind(-1)
         return torch.stack((self.frequency * x2, -self.frequency * x1), dim=-1)
 
     def flow(self, x: Tensor, time: Tensor) -> Tensor:

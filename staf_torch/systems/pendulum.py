@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..numerics.checks import keep, own_number
+from ..numerics.checks import keep, own_number, states
 from .base import ControlAffineSystem, Number, Units
 
 
@@ -48,7 +48,7 @@ class Pendulum(ControlAffineSystem):
         self.stiffness = keep(self, "stiffness", gravity / length)  # 1/s^2
 
     def drift(self, x: Tensor) -> Tensor:
-        angle, rate = x.unbind(-1)
+        angle, rate = states(self, "x", x, 2).unbind(-1)
         acceleration = self.stiffness * angle.sin() - (self.damping / self.inertia) * rate
         return torch.stack((rate, acceleration), dim=-1)
 

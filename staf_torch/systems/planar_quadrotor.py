@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..numerics.checks import keep, own_number
+from ..numerics.checks import keep, own_number, states
 from .base import ControlAffineSystem, Number, Units
 
 
@@ -45,7 +45,7 @@ class PlanarQuadrotor(ControlAffineSystem):
         self.gravity = keep(self, "gravity", own_number("PlanarQuadrotor", "gravity", gravity, "positive"))
 
     def drift(self, x: Tensor) -> Tensor:
-        angle = x[..., 2]
+        angle = states(self, "x", x, 6)[..., 2]
         fall = self.gravity * (angle.cos() - 1)
         forces = torch.stack((-self.gravity * angle.sin(), fall, torch.zeros_like(angle)), dim=-1)
         return torch.cat((x[..., 3:], forces), dim=-1)

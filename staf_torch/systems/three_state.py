@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ..numerics.checks import states
 from .base import ControlAffineSystem
 
 
@@ -28,7 +29,7 @@ class ThreeState(ControlAffineSystem):
     spread = 0.5
 
     def drift(self, x: Tensor) -> Tensor:
-        x1, x2, x3 = x.unbind(-1)
+        x1, x2, x3 = states(self, "x", x, 3).unbind(-1)
         square = x1 * (x1 + x2 + x3) + x2 * (x2 + x3) + x3.square()
         return torch.stack((x2, x3, square.sqrt()), dim=-1)
 

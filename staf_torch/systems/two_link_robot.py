@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ..numerics.checks import hold, positive_real, vector
+from ..numerics.checks import hold, positive_real, states, vector
 from .base import ControlAffineSystem, Units
 
 
@@ -55,7 +55,7 @@ class TwoLinkRobot(ControlAffineSystem):
         self.friction = hold(self, "friction", torch.tensor(given, dtype=torch.float64, device="cpu"))
 
     def drift(self, x: Tensor) -> Tensor:
-        p3 = self.inertia.to(x)[2]
+        p3 = self.inertia.to(states(self, "x", x, 4))[2]
         f1, f2, f3, f4 = self.friction.to(x).unbind(-1)
         bend, w1, w2 = x[..., 1].sin(), x[..., 2], x[..., 3]
         first = p3 * bend * w2 * (2 * w1 + w2) - f1 * w1 - f3 * w1.tanh()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ..numerics.checks import states
 from .base import ControlAffineSystem
 
 
@@ -36,7 +37,7 @@ class TwoState(ControlAffineSystem):
         self.as_printed = bool(as_printed)
 
     def drift(self, x: Tensor) -> Tensor:
-        x1, x2 = x.unbind(-1)
+        x1, x2 = states(self, "x", x, 2).unbind(-1)
         square = input_gain(x1).square()
         damping = square if self.as_printed else 1 - square
         return torch.stack((x2 - x1, -0.5 * x1 - 0.5 * x2 * damping), dim=-1)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ..numerics.checks import hold, numbers_of, vector
+from ..numerics.checks import hold, numbers_of, states, vector
 from .base import ControlAffineSystem
 from .two_state import input_gain
 
@@ -41,7 +41,7 @@ class TwoStateChain(ControlAffineSystem):
         self.theta = hold(self, "theta", torch.tensor(numbers, dtype=torch.float64, device="cpu"))
 
     def drift(self, x: Tensor) -> Tensor:
-        a, b, c, d = self.theta.to(x).unbind(-1)
+        a, b, c, d = self.theta.to(states(self, "x", x, 2)).unbind(-1)
         x1, x2 = x.unbind(-1)
         return torch.stack((a * x2, b * x1 + c * x2 + d * x2 * input_gain(x1).square()), dim=-1)
 

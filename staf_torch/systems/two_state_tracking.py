@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..numerics.checks import copied, fail, number
+from ..numerics.checks import copied, fail, number, states
 from .base import ControlAffineSystem
 from .two_state import input_gain
 
@@ -56,7 +56,7 @@ class TwoStateTracking(ControlAffineSystem):
         self.theta: Tensor
 
     def drift(self, x: Tensor) -> Tensor:
-        e, desired = x[..., :2], x[..., 2:]
+        e, desired = states(self, "x", x, 4)[..., :2], x[..., 2:]
         state, rate = e + desired, desired_rate(desired)
         pushed = input_gain(state[..., 0]) * feedforward(desired, self.theta)
         error_rate = parametric_drift(self.theta, state) - rate

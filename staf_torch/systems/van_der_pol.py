@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..numerics.checks import keep, own_number
+from ..numerics.checks import keep, own_number, states
 from .base import ControlAffineSystem, Number
 
 
@@ -34,7 +34,7 @@ class VanDerPol(ControlAffineSystem):
         self.damping = keep(self, "damping", own_number("VanDerPol", "damping", damping))
 
     def drift(self, x: Tensor) -> Tensor:
-        x1, x2 = x.unbind(-1)
+        x1, x2 = states(self, "x", x, 2).unbind(-1)
         return torch.stack((x2, self.damping * (1 - x1.square()) * x2 - x1), dim=-1)
 
     def effectiveness(self, x: Tensor) -> Tensor:
