@@ -85,6 +85,7 @@ def pytest_collection() -> Generator[None, object, object]:
     finally:
         gc.freeze()  # nor is what was there before looked through again
         gc.enable()
+        gc.set_threshold(10_000, 20, 20)  # a twelfth of the time of sweeps was looking for garbage
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -55,7 +55,13 @@ def alive(pid: int) -> bool:
 
 @pytest.mark.parametrize("ended", ["by itself", "by a signal"])
 def test_a_daemon_ends_with_the_command_that_left_it(ended: str, tmp_path: Path) -> None:
-    line = [*CONTAINED, "60", "sh", "-c", f"{DAEMON} {'exit 3' if ended == 'by itself' else 'sleep 1000'}"]
+    line = [
+        *CONTAINED,
+        "60",
+        "sh",
+        "-c",
+        f"{DAEMON} {'exit 3' if ended == 'by itself' else 'exec sleep 1000'}",
+    ]
     contained = subprocess.Popen(line, cwd=tmp_path, stderr=subprocess.DEVNULL)
     pid = tmp_path / "pid"
     while not pid.exists() or not pid.read_text():

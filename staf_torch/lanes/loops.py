@@ -9,6 +9,7 @@ g++ a text that grows with the passes, and the processor one that fits no cache.
 from __future__ import annotations
 
 import functools
+import itertools
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -152,16 +153,15 @@ def scan(
     """
     leaves, structure = flatten(inputs)
     count = leaves[0].shape[dim]
-
-    def at(k: int) -> Tree:
-        return unflatten(structure, iter([leaf.select(dim, k) for leaf in leaves]))
-
     tracer = None if unrolled or count < 2 else _tracer((carry, inputs))
-    if tracer is not None and not _fixed(tracer, (carry, inputs), lambda: body(carry, at(0))):
-        return _loop(tracer, count, body, carry, inputs, dim)
+    if tracer is not None:
+        first = unflatten(structure, iter([leaf.select(dim, 0) for leaf in leaves]))
+        if not _fixed(tracer, (carry, inputs), lambda: body(carry, first)):
+            return _loop(tracer, count, body, carry, inputs, dim)
     outputs, shape = [], None
-    for k in range(_passes(count)):
-        carry, out = body(carry, at(k))
+    every = zip(*[leaf.unbind(dim) for leaf in leaves], strict=True)
+    for at in itertools.islice(every, _passes(count)):
+        carry, out = body(carry, unflatten(structure, iter(at)))
         parts, shape = flatten(out)
         outputs.append(parts)
     outputs += outputs[-1:] * (count - len(outputs))
@@ -233,9 +233,8 @@ def each(body: Callable[[Tensor], Tensor], points: Tensor, *, dim: int = 1, toge
     if count <= together or (tracer := _tracer(points)) is None:
         return body(points)
     passes = -(-count // together)
-    spare = points.narrow(dim, 0, 1).expand(
-        *points.shape[:dim], passes * together - count, *points.shape[dim + 1 :]
-    )
+    more = passes * together - count
+    spare = points.narrow(dim, 0, 1).expand(*points.shape[:dim], more, *points.shape[dim + 1 :])
     grouped = torch.cat((points, spare), dim=dim).unflatten(dim, (passes, together))
     done: Tensor = _loop(tracer, passes, lambda _, now: ((), body(now)), (), grouped, dim)[1]
     return done.flatten(dim, dim + 1).narrow(dim, 0, count)
@@ -359,9 +358,8 @@ def _loop(
         after = _chosen(going, after, before)
     tracer.inside -= 1
     ends, end_structure = flatten(after)
-    if [(e.shape, e.dtype) for e in ends] != [
-        (g.shape, g.dtype) for g in given
-    ] or end_structure != structure:
+    forms, given_forms = ([(leaf.shape, leaf.dtype) for leaf in leaves] for leaves in (ends, given))
+    if forms != given_forms or end_structure != structure:
         raise NotLoweredError(
             "the body of a loop returns a carry of other shapes or dtypes than it was given"
         )
@@ -378,9 +376,8 @@ def _loop(
             ends = loop.following[done : done + len(nodes)]
             nodes = [e if graph.depth[e] < loop.depth else n for e, n in zip(ends, nodes, strict=True)]
         done += 1 if leaf.numel() > LARGE else leaf.numel()
-        results.append(
-            tracer.attach(leaf.detach().clone(), np.array(nodes, dtype=np.int64).reshape(leaf.shape))
-        )
+        ids = np.array(nodes, dtype=np.int64).reshape(leaf.shape)
+        results.append(tracer.attach(leaf.detach().clone(), ids))
     stacked = [_collected(tracer, leaf, dim, loop, number, k) for k, leaf in enumerate(out_leaves)]
     return unflatten(structure, iter(results)), unflatten(out_structure, iter(stacked))
 

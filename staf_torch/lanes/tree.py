@@ -29,7 +29,9 @@ def unflatten(structure: Any, leaves: Iterator[Any]) -> Any:
         return parts
     if isinstance(kind, tuple):
         return {name: unflatten(part, leaves) for name, part in zip(kind, parts, strict=True)}
-    values = [unflatten(part, leaves) for part in parts]
+    values = [next(leaves) if part is _LEAF else unflatten(part, leaves) for part in parts]
+    if kind is tuple:
+        return tuple(values)
     return kind(*values) if hasattr(kind, "_fields") else kind(values)
 
 
