@@ -157,7 +157,7 @@ def test_modules_of_one_class_become_one_with_the_numbers_of_all() -> None:
     with torch.no_grad():
         for found in (step(x, steps=1)[1], step.definition(x, steps=1)[1]):
             torch.testing.assert_close(found[:, 0], torch.stack([n(x[k]) for k, n in enumerate(nets)]))
-    with pytest.raises(ValueError, match="must be modules of one class; got Pendulum, VanDerPol"):
+    with pytest.raises(ValueError, match="or modules of one class; got Pendulum, VanDerPol"):
         st.rows([systems.Pendulum(), systems.VanDerPol()])
 
 

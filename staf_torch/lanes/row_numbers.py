@@ -12,6 +12,7 @@ function looks up; they announce themselves.
 from __future__ import annotations
 
 import copy
+import functools
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -252,10 +253,15 @@ def over_rows(function: Callable[..., Some], *given: Tree) -> Some:
         return function(*given)  # there are none, or somebody outside has said whose
     try:
         with resolving(_refuse):
-            return function(*given)
+            found = function(*given)
     except RowsMetError as met:
-        numbers = met.numbers
-    return _mapped(function, given, numbers)
+        return _mapped(function, given, met.numbers)
+    if any(isinstance(leaf, RowNumbers) for leaf in flatten(found)[0]):
+        raise ValueError(
+            "numbers of `rows(...)` were read in another thread than the call's, which knows no row: "
+            "compute with them where the function is called."
+        )
+    return found
 
 
 def each_row(function: Callable[[], Some], most: int | None = None, *, named: bool = False) -> list[Some]:
@@ -288,6 +294,22 @@ def each_row(function: Callable[[], Some], most: int | None = None, *, named: bo
                 raise
             raise ValueError(f"{error} (in row {row})") from error
     return found
+
+
+def beside(function: Callable[[], Some]) -> Some | None:
+    """function() with numbers beside those of the first row; None where that is against a rule."""
+    for share in (1 - 1e-6, 1 + 1e-6):
+        try:
+            with resolving(functools.partial(_other, share)):
+                return function()
+        except (ValueError, TypeError, RuntimeError):
+            continue
+    return None
+
+
+def _other(share: float, numbers: RowNumbers) -> Tensor:
+    first = columns([numbers], None)[0][0]
+    return torch.where(first == 0, abs(1 - share), first * share)
 
 
 @contextmanager

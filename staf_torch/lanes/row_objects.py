@@ -9,6 +9,7 @@ come out are of one structure, and where they differ they differ in numbers: ten
 from __future__ import annotations
 
 import abc
+import contextlib
 import functools
 import inspect
 import threading
@@ -21,7 +22,7 @@ import torch
 from torch import Tensor, nn
 
 from .contents import BOUND, Contents, Derived
-from .row_numbers import RowNumbers, each_row, in_use, met_rows, over_rows
+from .row_numbers import RowNumbers, beside, each_row, in_use, met_rows, over_rows
 from .tree import Shared, plain
 
 Some = TypeVar("Some")
@@ -63,11 +64,13 @@ def rows(numbers: Tensor | Sequence[nn.Module]) -> Any:
                 f"got the shape {tuple(numbers.shape)}."
             )
         return RowNumbers(numbers)
-    modules = list(numbers)
-    if not modules or any(type(each) is not type(modules[0]) for each in modules):
+    modules = list(numbers) if isinstance(numbers, Sequence | nn.ModuleList) else [numbers]
+    alike = modules and all(type(each) is type(modules[0]) for each in modules)
+    if not alike or not hasattr(modules[0], "__dict__") or isinstance(modules[0], Tensor):
         kinds = ", ".join(sorted({type(each).__name__ for each in modules}))
-        raise ValueError(f"`rows(numbers=...)` must be modules of one class; got {kinds or 'none'}.")
-    return merged(modules)
+        rule = "must be a tensor (B, ...), as `torch.stack` makes it, or modules of one class"
+        raise ValueError(f"`rows(numbers=...)` {rule}; got {kinds or 'none'}.")
+    return _of_all(modules)
 
 
 def refuse_rows(call: str, **given: Any) -> None:
@@ -105,7 +108,12 @@ def made_by_rows(make: Callable[[], Some]) -> Some:
         return make()
     with met_rows() as met:
         found = each_row(make, named=True)
-    return merged(found) if met else found[0]
+    if not met:
+        return found[0]
+    made = _of_all(found)
+    if any(isinstance(tensor, RowNumbers) for tensor in Contents(made).tensors):
+        return made
+    return _of_all(found, beside(make))  # as many rows as there are, although all are alike
 
 
 class Rowwise(abc.ABCMeta):
@@ -142,12 +150,10 @@ class OfRows(Rowwise):
 def _made_with_rows(cls: type[Some], *args: Any, **kwargs: Any) -> Some:
     """Make an object of a class of `OfRows`: with numbers of rows for all rows at once, or row by row."""
     make: Callable[..., Some] = functools.partial(type.__call__, cls)
-    if not in_use():
-        return make(*args, **kwargs)
     if not _holds_rows((args, kwargs)):
         return made_by_rows(lambda: make(*args, **kwargs))
     try:
-        return make(*args, **kwargs)  # with all rows at once
+        return make(*args, **kwargs)  # with all rows at once, or within one of them
     except (ValueError, TypeError, RuntimeError):  # it decides by values, or takes no tensors
         pass
 
@@ -178,14 +184,12 @@ RowNumbers.prepare.append(_serve_rows)
 def _of_points(method: Any, dims: Sequence[int]) -> Any:
     """Return a method that takes points (B, ...) row by row where it reads numbers of rows."""
 
-    signature = inspect.signature(method)
-
     @functools.wraps(method)
     def of_points(self: Any, *args: Any, **kwargs: Any) -> Any:
         if not in_use():
             return method(self, *args, **kwargs)
         if kwargs:
-            bound = signature.bind(self, *args, **kwargs)
+            bound = inspect.signature(method).bind(self, *args, **kwargs)
             args, kwargs = bound.args[1:], bound.kwargs
         given = [_with_rows(arg, size) for arg, size in zip(args, dims, strict=False)]
         rest = args[len(given) :]
@@ -223,21 +227,27 @@ def _with_rows(value: Any, size: int) -> Any:
     return Shared(value) if isinstance(value, Tensor) and value.dim() <= size else value
 
 
-def merged(objects: Sequence[Some]) -> Some:
+def _of_all(objects: Sequence[Some], other: Some | None = None) -> Some:
     """Return the object that has the numbers of all rows.
 
     Args:
         objects: one a row, of one class and structure.
+        other: one with other numbers; equal numbers in which it differs are of rows, too.
 
     Raises:
         ValueError: if they differ in more than numbers.
     """
+    if other is not None:
+        with contextlib.suppress(ValueError):  # it may differ in more
+            found: Some = _Merge(rows=len(objects)).of([*objects, other], type(objects[0]).__name__)
+            return found
     made: Some = _Merge().of(list(objects), type(objects[0]).__name__)
     return made
 
 
 class _Merge:
-    def __init__(self) -> None:
+    def __init__(self, rows: int | None = None) -> None:
+        self._rows = rows  # that are kept, all by default
         self._made: dict[tuple[int, ...], Any] = {}
         self._kept: list[Any] = []  # addresses are used once
 
@@ -253,7 +263,7 @@ class _Merge:
         if kind is float:
             if all(value == first or (value != value and first != first) for value in values):
                 return first
-            return RowNumbers(torch.tensor(values, dtype=torch.float64, device="cpu"))
+            return RowNumbers(torch.tensor(values[: self._rows], dtype=torch.float64, device="cpu"))
         key = tuple(map(id, values))
         if key not in self._made:
             self._kept.append(values)
@@ -262,7 +272,8 @@ class _Merge:
 
     def _tensor(self, values: list[Any], name: str) -> Any:
         if any(isinstance(value, RowNumbers) for value in values):  # of which each has its own row
-            values = [v.full[k] if isinstance(v, RowNumbers) else v for k, v in enumerate(values)]
+            pairs = enumerate(values)
+            values = [v.full[k % len(v.full)] if isinstance(v, RowNumbers) else v for k, v in pairs]
         first = values[0]
         alike = all(
             isinstance(v, Tensor) and v.shape == first.shape and v.dtype == first.dtype for v in values
@@ -273,7 +284,7 @@ class _Merge:
             return first
         if not first.is_floating_point():
             raise self._differ(values, name)
-        made = RowNumbers(torch.stack([value.detach() for value in values]))
+        made = RowNumbers(torch.stack([value.detach() for value in values[: self._rows]]))
         return nn.Parameter(made, first.requires_grad) if isinstance(first, nn.Parameter) else made
 
     def _new(self, values: list[Any], kind: type, name: str, key: tuple[int, ...]) -> Any:

@@ -148,6 +148,8 @@ def solve(
     belongs = order.unsqueeze(-2) == place.unsqueeze(-1)
     solution = torch.where(belongs.unsqueeze(-1), whole[..., :width].unsqueeze(-3), 0.0).sum(-2)
     factor, pivots = torch.full_like(matrix, torch.nan), torch.full_like(matrix[..., 0], -1).int()
+    for _ in range(failed.dim() - matrix.dim() + 2):  # a matrix of several right sides
+        failed = failed[0]
     return solution.squeeze(-1) if vector else solution, factor, pivots, failed.int()
 
 
