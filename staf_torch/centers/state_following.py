@@ -8,6 +8,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
+from ..lanes.row_numbers import RowNumbers
 from ..lanes.row_objects import OfRows
 from ..numerics.checks import fail, hold, kept, non_negative, positive, shown, trailing, values_of
 from ..numerics.row_checks import check_radius
@@ -64,7 +65,8 @@ class ConstantRadius(Radius):
         return kept(self, "radius")
 
     def forward(self, x: Tensor) -> Tensor:
-        return kept(self, "radius").to(x)
+        radius = kept(self, "radius").to(x)
+        return radius.expand(x.shape[:-1]) if isinstance(self.radius, RowNumbers) else radius  # a row's own
 
 
 class StateRadius(Radius):

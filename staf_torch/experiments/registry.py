@@ -139,6 +139,7 @@ EXPERIMENTS: Mapping[str, str] = {
     "exponential_bound": "theorems.exponential_bound",
     "feasibility": "theorems.feasibility",
     "layouts": "theorems.layouts",
+    "learn_kernel": "learn_kernel.run",
     "memory": "memory.run",
     "adp": "adp.Regulation",
     "adp_comparison": "adp_comparison.run",
