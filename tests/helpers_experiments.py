@@ -40,6 +40,8 @@ CASES: dict[str, str] = {
     "icl": "experiment=icl trajectories=3 dt=0.01 duration=0.5 settle_time=0.1 icl.length=[0.02,0.04]",
     "laws": "experiment=laws dt=0.1 duration=1.0 settle_time=0.5 laws.steps=[0.1,0.05] laws.work=4",
     "layouts": "experiment=layouts layouts.states=4 layouts.radii=[0.1,0.2]",
+    "learn_kernel": "experiment=learn_kernel optimizer=exact centers.count=3 dt=0.1 duration=1.0 "
+    "settle_time=0.5 learn_kernel.steps=4 learn_kernel.widths.count=2 learn_kernel.radii.count=3",
     "memory": "experiment=memory duration=8 dt=0.02 memory.steps=30 memory.revisits=6 memory.states=40",
     "rivals": "experiment=rivals rivals.plants=[double_integrator] rivals.methods=[LQR,discrete~LQR,IPOPT] "
     "rivals.states=1 rivals.calls=10",

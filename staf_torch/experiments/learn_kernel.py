@@ -73,7 +73,7 @@ class Learning(NamedTuple):
         return gap.square().mean(dim=(-1, -2))
 
     def error(self, logarithms: Tensor) -> Tensor:
-        """The root mean square over all trajectories, with a gradient; logarithms of width and radius (2,)."""
+        """The root mean square over all trajectories; the logarithms of width and radius, (2,)."""
         width, radius = logarithms.exp()
         return self.squares(width, radius, self.states).mean().sqrt()
 
@@ -83,7 +83,10 @@ class Learning(NamedTuple):
         states = self.states.repeat(len(radii), 1, 1)
         each = rows(radii.repeat_interleave(batch))
         columns = [
-            self.squares(rows(width.expand(len(states))), each, states).reshape(len(radii), batch).mean(1).sqrt()
+            self.squares(rows(width.expand(len(states))), each, states)
+            .reshape(len(radii), batch)
+            .mean(1)
+            .sqrt()
             for width in progress.each(list(widths), "widths of the grid")
         ]
         return torch.stack(columns, dim=1)
@@ -91,10 +94,11 @@ class Learning(NamedTuple):
 
 def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
     """Run what the settings describe and fill the run directory; `metrics.json` comes last."""
-    problem = problem_of(cfg)
     steps = integer(COMMAND_LINE, "learn_kernel.steps", cfg.learn_kernel.steps, least=1)
     rate = positive_real(COMMAND_LINE, "learn_kernel.rate", cfg.learn_kernel.rate)
-    widths, radii = (_ratios(cfg, name).to(problem.states) for name in ("widths", "radii"))
+    axes = [_ratios(cfg, name) for name in ("widths", "radii")]
+    problem = problem_of(cfg)
+    widths, radii = (axis.to(problem.states) for axis in axes)
     path, errors = learn(problem, steps, rate, progress)
     grid = problem.grid(widths, radii, progress)
     out = RunDirectory(directory)
@@ -102,9 +106,9 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
         {"step": k, "width": float(w), "radius": float(r), "error": float(e)}
         for k, ((w, r), e) in enumerate(zip(path.exp(), errors, strict=True))
     ]
-    picture = LearnedKernel(
-        *(x.cpu().numpy() for x in (widths, radii, grid, path.exp(), errors)), name=problem.name
-    )
+    way = path.exp()
+    numbers = [x.cpu().numpy() for x in (widths, radii, grid, way, errors)]
+    picture = LearnedKernel(problem.name, *numbers)
     drawing = (lambda: draw_learned_kernel(picture)) if draws(cfg.figures) else None
     shown = Table.of(taken[:: -(-len(taken) // _SHOWN)])
     report(out, _log, "learn_kernel", Table.of(taken), drawing, shown=shown, heading="Along the way:")
@@ -117,6 +121,7 @@ def problem_of(cfg: DictConfig) -> Learning:
     Raises:
         ValueError: for a kernel without a width or a length scale, or a radius that depends on the state.
     """
+    ball = positive_real(COMMAND_LINE, "learn_kernel.ball", cfg.learn_kernel.ball)
     problem = chase_problem(cfg)
     name = next((n for n in _SCALES if n in cfg.kernel), None)
     if name is None:
@@ -129,7 +134,6 @@ def problem_of(cfg: DictConfig) -> Learning:
     first = math.ceil(problem.settle_time / problem.dt - 1e-9)
     if first >= states.shape[1]:
         raise fail(COMMAND_LINE, "settle_time", "must be before the end", problem.settle_time)
-    ball = positive_real(COMMAND_LINE, "learn_kernel.ball", cfg.learn_kernel.ball)
     start = [float(cfg.kernel[name]), float(cfg.centers.radius)]
     return Learning(
         problem,
@@ -158,7 +162,7 @@ def learn(problem: Learning, steps: int, rate: float, progress: Progress = SHOWN
         if k < steps:
             optimiser.zero_grad()
             error.log().backward()
-            # The way of a law over many steps is chaotic here and there, and its derivative then says nothing.
+            # The way of a law over many steps is chaotic here and there: its derivative then says nothing.
             torch.nn.utils.clip_grad_norm_(at, _STEEPEST)
             optimiser.step()
     return torch.stack(points), torch.stack(errors)
@@ -184,9 +188,12 @@ def _ratios(cfg: DictConfig, name: str) -> Tensor:
     """The numbers of an axis of the grid, equal ratios apart."""
     stated = cfg.learn_kernel[name]
     low, high = (
-        positive_real(COMMAND_LINE, f"learn_kernel.{name}.{end}", stated[end]) for end in ("smallest", "largest")
+        positive_real(COMMAND_LINE, f"learn_kernel.{name}.{end}", stated[end])
+        for end in ("smallest", "largest")
     )
     if low >= high:
-        raise fail(COMMAND_LINE, f"learn_kernel.{name}.largest", f"must be above the smallest ({low:g})", high)
+        raise fail(
+            COMMAND_LINE, f"learn_kernel.{name}.largest", f"must be above the smallest ({low:g})", high
+        )
     count = integer(COMMAND_LINE, f"learn_kernel.{name}.count", stated.count, least=2)
     return torch.logspace(math.log10(low), math.log10(high), count, dtype=torch.float64, device="cpu")

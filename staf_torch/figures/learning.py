@@ -17,12 +17,12 @@ if TYPE_CHECKING:
 class LearnedKernel(NamedTuple):
     """The way of a kernel's width and its centers' radius over a grid of both."""
 
+    name: str  # of the width, in words
     widths: np.ndarray  # (W,)
     radii: np.ndarray  # (R,)
     grid: np.ndarray  # errors (R, W)
     path: np.ndarray  # width and radius after each step, (S + 1, 2)
     errors: np.ndarray  # (S + 1,)
-    name: str  # of the width, in words
 
 
 def draw_learned_kernel(picture: LearnedKernel) -> Figure:

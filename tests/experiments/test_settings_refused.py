@@ -32,6 +32,7 @@ EXPERIMENTS: dict[str, tuple[str, ...]] = {
     "gradient_chase": (),
     "icl": ("experiment=icl",),
     "laws": ("experiment=laws",),
+    "learn_kernel": ("experiment=learn_kernel",),
     "theorems": ("experiment=exponential_bound",),
     "memory": ("experiment=memory",),
     "rivals": ("experiment=rivals",),
