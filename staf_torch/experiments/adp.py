@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import logging
 import math
@@ -14,8 +13,8 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from ..adp import ActorCritic, Controller, Cost, Gains, LoopResult, SafetyFilter, Supervised, simulate
-from ..adp.loop.picture import picture
+from ..adp import ActorCritic, Controller, Cost, LoopResult, SafetyFilter, Supervised, simulate
+from ..adp.loop.picture import LoopAbout, picture
 from ..adp.loop.setup import AdpProblem
 from ..adp.planning.shooting.reference_optimum import LoopOptimum, compare
 from ..adp.problem.held_linear import HeldLoop
@@ -23,11 +22,14 @@ from ..figures.closed_loop import AdpHistory, draw_adp
 from ..figures.style import draws, images
 from ..lanes.tree import flatten, unflatten
 from ..metrics.closed_loop import adp_metrics
+from ..results.files import grouped
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.adp import adp_problem
 from ..settings.chase import make_metrics
+from ..systems import Plant
 from ..tables.columns import significant
+from .numbers_of_jobs import RowsOfJobs, in_calls
 from .registry import BatchedExperiment, Metrics
 from .scenes import animation_kind, loop_scene, write_animation
 from .study import log_diverged, trajectories, write_history
@@ -51,12 +53,14 @@ class LoopSolution:
 
 
 class Regulation(BatchedExperiment[LoopSolution]):
-    """Optimal regulation; initial states, seeds, initial weights and gains share a tensor batch."""
+    """Optimal regulation; jobs that differ in numbers of plant, cost and controller share a tensor batch."""
 
     animates = True
     batchable = frozenset(
-        {"seed", "initial_state", "spread", "adp.critic", "adp.actor", "adp.gain", "adp.policy.gain"}
-        | {f"adp.{node}.{each.name}" for node in ("gains", "law.gains") for each in dataclasses.fields(Gains)}
+        {
+            *("seed", "initial_state", "spread", "system.*", "kernel.*", "adp.*"),
+            *("centers.radius", "centers.directions", "centers.shrink.*"),
+        }
     )
 
     def __call__(self, cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
@@ -167,21 +171,49 @@ def solve(problem: AdpProblem, progress: Progress = SHOWN) -> LoopResult:
 def simulate_together(
     problems: Sequence[AdpProblem], progress: Callable[[int], None] | None = None
 ) -> list[LoopResult]:
-    """Run problems that differ in initial states, seeds, initial weights and gains alone.
+    """Run problems; those that differ in numbers alone are one loop with a row of numbers each.
 
     Args:
-        problems: at least one, alike in everything else.
+        problems: at least one; of the same number of steps.
         progress: as in `simulate`.
     """
+    found: dict[int, LoopResult] = {}
+
+    def shared(i: int) -> tuple[object, ...]:
+        one = problems[i]
+        return one.dt, one.steps, one.every, one.integrator, one.compile
+
+    for indices in grouped(range(len(problems)), shared).values():
+
+        def run(
+            jobs: Sequence[int], objects: Any, rows: RowsOfJobs, indices: Sequence[int] = indices
+        ) -> None:
+            chosen = [indices[job] for job in jobs]
+            with rows.of():
+                results = _simulated([problems[i] for i in chosen], objects, progress)
+            found.update(zip(chosen, results, strict=True))
+
+        in_calls(
+            [(problems[i].controller, problems[i].system, problems[i].cost) for i in indices],
+            [len(problems[i].initial_states) for i in indices],
+            run,
+        )
+    return [found[i] for i in range(len(problems))]
+
+
+def _simulated(
+    problems: Sequence[AdpProblem],
+    objects: tuple[Controller, Plant, Cost],
+    progress: Callable[[int], None] | None,
+) -> list[LoopResult]:
+    """Run problems as one loop of these objects."""
     first = problems[0]
-    rows = [len(problem.initial_states) for problem in problems]
+    counts = [len(problem.initial_states) for problem in problems]
     seeds = [
-        problem.seed + row for problem, batch in zip(problems, rows, strict=True) for row in range(batch)
+        problem.seed + row for problem, rows in zip(problems, counts, strict=True) for row in range(rows)
     ]
-    return simulate(
-        _stacked([problem.controller for problem in problems], rows),
-        first.system,
-        first.cost,
+    result = simulate(
+        *objects,
         torch.cat([problem.initial_states for problem in problems]),
         dt=first.dt,
         steps=first.steps,
@@ -190,35 +222,29 @@ def simulate_together(
         integrator=first.integrator,
         compile=first.compile,
         progress=progress,
-    ).split(rows)
+    )
+    if len(problems) == 1:
+        return [result]
+    return [
+        dataclasses.replace(part, about=_about(problem))
+        for part, problem in zip(result.split(counts), problems, strict=True)
+    ]
 
 
-def _stacked(controllers: Sequence[Controller], rows: Sequence[int]) -> Controller:
-    """Join several controllers whose initial weights and gains differ into one."""
-    if len(controllers) == 1:
-        return controllers[0]
-    stacked = copy.deepcopy(controllers[0])
-    target = learner(stacked)
-    if target is None:
-        return stacked
-    given = [one for each in controllers if (one := learner(each)) is not None]
-    counts = torch.tensor(rows, dtype=torch.int64, device="cpu")
-    for name in ("critic", "actor", "gain"):
-        values = torch.stack([getattr(one, name) for one in given])
-        setattr(target, name, values.repeat_interleave(counts.to(values.device), dim=0))
-    target.law.gains = _gains([one.law.gains for one in given], counts, target.critic)
-    return stacked
+def _about(problem: AdpProblem) -> LoopAbout:
+    """Return what a result of `simulate` says of the loop of one problem."""
 
+    def again(other: Controller, start: Tensor) -> LoopResult:
+        return simulate(
+            *(other, problem.system, problem.cost, start),
+            dt=problem.dt,
+            steps=problem.steps,
+            every=problem.every,
+            integrator=problem.integrator,
+        )
 
-def _gains(gains: Sequence[Gains], counts: Tensor, like: Tensor) -> Gains:
-    """Numbers where all agree, else (B, 1) of the dtype and on the device of ``like``."""
-
-    def joined(values: list[float]) -> float | Tensor:
-        rows = torch.tensor(values, dtype=torch.float64, device="cpu").repeat_interleave(counts).to(like)
-        return values[0] if len(set(values)) == 1 else rows.unsqueeze(-1)
-
-    names = [field.name for field in dataclasses.fields(Gains)]
-    return Gains(**{name: joined([getattr(each, name) for each in gains]) for name in names})
+    cost = problem.cost.around(problem.system)
+    return LoopAbout.of(problem.controller, problem.system, cost, problem.dt, again)
 
 
 def innermost(controller: Controller) -> Controller:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import logging
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
@@ -16,22 +14,17 @@ from torch import Tensor
 from ..approximation.basis import REACH, StaFBasis, Target
 from ..engine import ChaseResult, chase_pieces, chunk_length
 from ..engine.predictors import Predictor
-from ..lanes.contents import Contents
-from ..lanes.row_numbers import over_rows, some_rows
-from ..lanes.row_objects import merged
+from ..lanes.row_numbers import over_rows
 from ..metrics.ball_error import StateErrorPass
 from ..metrics.chase import ChaseMetrics, Member
 from ..optim import UpdateLaw
 from ..results.files import grouped
 from ..settings.chase import ChaseProblem, warnings_to
 from ..systems import ControlAffineSystem, trajectory
+from .numbers_of_jobs import RowsOfJobs, in_calls
 
 Sink = Callable[[Mapping[str, np.ndarray], int, int], None]
 """Takes a piece of a problem's history, name -> (b, C, ...), with its first row and its first time."""
-
-_log = logging.getLogger(__name__)
-_REFUSALS = (ValueError, TypeError, NotImplementedError, RuntimeError)
-"""What objects raise that do not serve numbers of a row's own."""
 
 HISTORY = ("state", "value", "estimate", "weights", "ideal_weights", "excess")
 _DRAWN = (*HISTORY, "ideal_estimate")
@@ -76,27 +69,24 @@ def simulate(
     found: dict[int, Outcome] = {}
     alone = len(problems) == 1
 
-    def run(indices: Sequence[int], parts: _Objects, kinds: Sequence[int]) -> None:
-        members = [_BatchMember(problems[i], sinks[i], drawn[i]) for i in indices]
-        found.update(zip(indices, _run(members, parts, kinds, advance, errors, alone=alone), strict=True))
-
     def shared(i: int) -> tuple[object, ...]:
         return (problems[i].dt, *map(id, problems[i].metrics))
 
     for indices in grouped(range(len(problems)), shared).values():
-        by_parts = grouped(indices, lambda i: _Identical(_parts(problems[i])))
-        own = bool(problems[indices[0]].metrics)  # of the user's, which see one problem at a time
-        for alike, joined in _alike([key.parts for key in by_parts], own=own):
-            each = [by_parts[_Identical(parts)] for parts in alike]
-            try:
-                if joined is not None:
-                    kinds = [k for k, some in enumerate(each) for _ in some]
-                    run([i for some in each for i in some], joined, kinds)
-                    continue
-            except _REFUSALS as error:
-                _log.debug("%d problems run one after the other: %s", len(alike), error)
-            for parts, some in zip(alike, each, strict=True):
-                run(some, parts, [0] * len(some))
+
+        def run(
+            jobs: Sequence[int], parts: _Objects, rows: RowsOfJobs, indices: Sequence[int] = indices
+        ) -> None:
+            chosen = [indices[job] for job in jobs]
+            members = [_BatchMember(problems[i], sinks[i], drawn[i]) for i in chosen]
+            found.update(zip(chosen, _run(members, parts, rows, advance, errors, alone=alone), strict=True))
+
+        in_calls(
+            [_Objects.of(problems[i]) for i in indices],
+            [len(problems[i].initial_states) for i in indices],
+            run,
+            apart=bool(problems[indices[0]].metrics),  # of the user's, which see one problem at a time
+        )
     return [found[i] for i in range(len(problems))]
 
 
@@ -109,47 +99,15 @@ class _Objects(NamedTuple):
     law: UpdateLaw
     predictor: Predictor | None
 
-
-def _parts(problem: ChaseProblem) -> _Objects:
-    return _Objects(problem.system, problem.basis, problem.target, problem.law, problem.predictor)
-
-
-class _Identical:
-    """Key that is equal for the same objects: `settings.chase.Parts` makes equal settings one."""
-
-    def __init__(self, parts: _Objects) -> None:
-        self.parts, self._ids = parts, tuple(map(id, parts))
-
-    def __hash__(self) -> int:
-        return hash(self._ids)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Identical) and self._ids == other._ids
-
-
-def _alike(parts: Sequence[_Objects], *, own: bool) -> list[tuple[Sequence[_Objects], _Objects | None]]:
-    """Return the parts in sets, with the objects that have the numbers of all of a set; None of one alone.
-
-    Args:
-        parts: of problems.
-        own: whether each stays alone.
-    """
-    if own or len(parts) == 1:
-        return [([each], None) for each in parts]
-    try:
-        return [(parts, merged(parts))]
-    except ValueError:  # they differ in more than numbers
-        keys = [Contents(*each, telling=True).key for each in parts]
-    sets = grouped(range(len(parts)), lambda i: (i,) if keys[i] is None else keys[i])
-    if len(sets) == 1:
-        return [([each], None) for each in parts]
-    return [found for some in sets.values() for found in _alike([parts[i] for i in some], own=False)]
+    @classmethod
+    def of(cls, problem: ChaseProblem) -> _Objects:
+        return cls(*(getattr(problem, name) for name in cls._fields))
 
 
 def _run(
     members: Sequence[_BatchMember],
     parts: _Objects,
-    kinds: Sequence[int],
+    rows: RowsOfJobs,
     advance: Callable[[int], None] | None,
     errors: StateErrorPass | None,
     *,
@@ -162,14 +120,12 @@ def _run(
     Args:
         members: the problems.
         parts: theirs, with numbers of rows where they differ.
-        kinds: of each member, the row of those numbers.
+        rows: of all members.
         advance, errors: of `simulate`.
         alone: whether there is no other problem.
     """
     first, basis = members[0].problem, parts.basis
     times, starts = first.steps + 1, torch.cat([member.problem.initial_states for member in members])
-    counts = torch.tensor([member.rows for member in members], dtype=torch.int64, device="cpu")
-    kind = torch.tensor(kinds, dtype=torch.int64, device="cpu").repeat_interleave(counts)  # (B,)
     metrics = ChaseMetrics(
         basis,
         parts.target,
@@ -195,10 +151,10 @@ def _run(
         if not told:
             warnings.filterwarnings("ignore", message=REACH)
         for block in blocks:
-            rows, time = slice(done, done + len(block)), 0
+            here, time = slice(done, done + len(block)), 0
             if done:
                 metrics.next_rows()
-            with some_rows(kind[rows]) if len(set(kinds)) > 1 else contextlib.nullcontext():
+            with rows.of(here):
                 chased = chase_pieces(
                     trajectory(parts.system, block, dt=first.dt, steps=first.steps, chunk=chunk),
                     basis,
@@ -211,14 +167,14 @@ def _run(
                 for result in chased:
                     metrics.add(result)
                     if not told:
-                        reach[rows] = torch.maximum(reach[rows], _reach(basis, result.state))
+                        reach[here] = torch.maximum(reach[here], _reach(basis, result.state))
                     _distribute(result, done, time, members)
                     time += result.state.shape[1]
                     tell(result.state.shape[0] * result.state.shape[1])
             done += len(block)
     if alone and not told:
         basis.warn_reach(float(reach.max()), stacklevel=2)
-    found = zip(members, metrics.summaries(), reach.split(counts.tolist()), strict=True)
+    found = zip(members, metrics.summaries(), reach.split([member.rows for member in members]), strict=True)
     return [member.outcome(summary, float(own.max()), alone=alone) for member, summary, own in found]
 
 

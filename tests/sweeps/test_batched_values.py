@@ -189,6 +189,7 @@ def test_a_sweep_of_numbers_and_counts_is_one_call_for_each_count(caplog: pytest
 
 
 CLOSED = ("dt=0.005", "duration=0.1", "adp.compile=false", "figures=false")
+SHORT_LOOP = ("adp.optimum.shooting=false", "initial_state=[0.5,0.0]")
 LOOPS = {
     "information": ([], ["seed=0,1", "adp.critic=0.4,0.8", "adp.gains.actor=1.2,2.0"]),
     "published": (
@@ -204,6 +205,15 @@ LOOPS = {
         ["adp.gains.normalisation=0.05,0.5", "adp.gains.forgetting=0.003,0.01"],
     ),
     "lqr": (["adp/policy=lqr"], ["initial_state=[-1.0,1.0],[0.5,0.5]"]),
+    "plants": (
+        ["adp/policy=lqr", "system=pendulum", *SHORT_LOOP],
+        ["system.mass=0.5,2", "adp.cost.control=1,3"],
+    ),
+    "bases": ([], ["centers.shrink.gain=1,1.5", "adp.half_width=0.5,0.6"]),
+    "behind walls": (
+        ["adp/policy=lqr", "system=pendulum", "adp.walls.high=[1.0,null]", *SHORT_LOOP],
+        ["system.mass=0.5,2", "seed=0,1"],
+    ),
     "single precision": (["dtype=float32"], ["adp.gains.information=1,2", "seed=0,1"]),
 }
 

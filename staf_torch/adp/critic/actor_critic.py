@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping
-from typing import Any, Self
 
 import torch
 from torch import Tensor
 
-from ...lanes.row_numbers import RowNumbers
-from ...numerics.checks import copied, fail, positive, trailing, vector
+from ...numerics.checks import fail, positive, trailing, vector
 from ...numerics.default_device import device_of
 from ...systems import ControlAffineSystem
 from ..loop.controller import Controller
@@ -108,17 +105,6 @@ class ActorCritic(Controller):
 
     def recorded(self, carried: Weights) -> dict[str, Tensor]:
         return {"actor_weights": carried.actor, "critic_weights": carried.critic}
-
-    def numbers(self) -> dict[str, float | Tensor]:
-        gains = vars(self.law.gains)  # those of `rows` are columns by themselves
-        return {name: value for name, value in gains.items() if not isinstance(value, RowNumbers)}
-
-    def with_numbers(self, numbers: Mapping[str, Any]) -> Self:
-        other = copied(self)
-        other.law, gains = copy.copy(self.law), copy.copy(self.law.gains)
-        vars(gains).update(numbers)  # without the checks, which would read a traced number
-        other.law.gains = gains
-        return other
 
     def terms(
         self, x: Tensor, actor: Tensor, uniform: Tensor, model: ControlAffineSystem | None = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 import math
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -20,19 +20,14 @@ from .bellman import BellmanTerms, bellman_error
 _UNROLLED = 12  # unknowns up to which elimination by whole-batch operations is the faster one
 
 Gain = float | Tensor
-"""A number, of `rows` one a row, or (B, 1)."""
-
-
-def over_matrices(gain: Gain) -> Gain:
-    """A gain as a factor of (B, M, M)."""
-    return gain.unsqueeze(-1) if isinstance(gain, Tensor) and gain.dim() else gain
+"""A number, or one a row of `rows`."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Gains(metaclass=OfRows):
     """Gains of the actor-critic laws; the defaults are the published ones of the two-state example.
 
-    Each is a number, by `staf_torch.rows` one a trajectory, or a tensor (B, 1) of these.
+    Each is a number, or by `staf_torch.rows` one a trajectory.
 
     Example:
         >>> adp.Gains(actor=15.0).actor
@@ -68,8 +63,8 @@ class Gains(metaclass=OfRows):
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
             value = non_negative("Gains", field.name, getattr(self, field.name))
-            if value.dim() and (value.dim() != 2 or value.shape[-1] != 1):
-                raise fail("Gains", field.name, "must be a number or of the shape (B, 1)", tuple(value.shape))
+            if value.dim():
+                raise fail("Gains", field.name, "must be a number, or `rows` of numbers", tuple(value.shape))
 
 
 class Weights(NamedTuple):
@@ -106,6 +101,8 @@ class ActorCriticLaw(metaclass=OfRows):
     Raises:
         ValueError: if ``bound`` is not positive.
     """
+
+    rowwise: ClassVar = {"sums": (0, 1, 0), "rates": (0, 0), "step": (0, 0)}
 
     def __init__(self, gains: Gains | None = None, bound: float | None = None) -> None:
         self.gains = Gains() if gains is None else gains
@@ -159,10 +156,8 @@ class ActorCriticLaw(metaclass=OfRows):
 
 
 def _shares(here: Gain, there: Gain, masses: Tensor) -> Tensor:
-    """The gain at the state, then those at the points: (P,), or (B, P) where each trajectory has its own."""
-    first, rest = here * masses.new_ones(1), there * masses
-    rows = torch.broadcast_tensors(first.sum(-1), rest.sum(-1))[0].shape
-    return torch.cat((first.expand(*rows, -1), rest.expand(*rows, -1)), dim=-1)
+    """The gain at the state, then those at the points: (P,)."""
+    return torch.cat((here * masses.new_ones(1), there * masses))
 
 
 class Published(ActorCriticLaw):
@@ -192,7 +187,7 @@ class Published(ActorCriticLaw):
         return Weights(
             critic=-matvec(gain, sums.critic_force),
             actor=self.actor_rate(sums, weights),
-            gain=over_matrices(self.gains.forgetting) * gain - shrink,
+            gain=self.gains.forgetting * gain - shrink,
         )
 
     def _move(self, sums: BellmanSums, weights: Weights, dt: float) -> Weights:
@@ -229,7 +224,7 @@ class Information(ActorCriticLaw):
         return Weights(
             critic=-solve_definite(weights.gain, sums.critic_force),
             actor=self.actor_rate(sums, weights),
-            gain=sums.information - over_matrices(self.gains.forgetting) * weights.gain,
+            gain=sums.information - self.gains.forgetting * weights.gain,
         )
 
     def _move(self, sums: BellmanSums, weights: Weights, dt: float) -> Weights:
@@ -243,9 +238,9 @@ class Information(ActorCriticLaw):
 
 
 def _decay(forgetting: Gain, dt: float) -> Gain:
-    """e^{-beta dt} as a factor of (B, M, M)."""
+    """e^{-beta dt}."""
     if isinstance(forgetting, Tensor):
-        return over_matrices((-forgetting * dt).exp())
+        return (-forgetting * dt).exp()
     return math.exp(-forgetting * dt)
 
 
@@ -353,4 +348,4 @@ class PolicyIteration(ActorCriticLaw):
 
     def _newton(self, sums: BellmanSums) -> Tensor:
         one = sums.curvature.new_ones(sums.curvature.shape[-1]).diag_embed()
-        return -solve_definite(sums.curvature + over_matrices(self.damping) * one, sums.critic_force)
+        return -solve_definite(sums.curvature + self.damping * one, sums.critic_force)

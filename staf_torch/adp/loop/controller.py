@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -14,7 +14,7 @@ from ...lanes.contents import is_users, version
 from ...lanes.gradients import gradients_of, marked
 from ...lanes.row_numbers import over_rows
 from ...lanes.row_objects import OfRows
-from ...numerics.checks import copied, real, trailing
+from ...numerics.checks import real, trailing
 from ...numerics.default_device import beside
 from ...numerics.linalg import riccati
 from ...numerics.shown import limits, shown
@@ -98,22 +98,6 @@ class Controller(nn.Module, metaclass=OfRows):
     def value(self, x: Tensor, recorded: Mapping[str, Tensor]) -> Tensor | None:
         """Return V^(x), (..., n) -> (...), by what was recorded then; None where nothing estimates V."""
         return None
-
-    def numbers(self) -> dict[str, float | Tensor]:
-        """Name the numbers in which runs of one compiled loop may differ: floats, or (B, 1), one a row.
-
-        By default those of the controllers that this one holds.
-        """
-        inner = (child for child in self.children() if isinstance(child, Controller))
-        return {name: value for child in inner for name, value in child.numbers().items()}
-
-    def with_numbers(self, numbers: Mapping[str, Any]) -> Self:
-        """Return a copy with other numbers in place of those that `numbers` names; not checked."""
-        other = copied(self)
-        for name, child in self.named_children():
-            if isinstance(child, Controller):
-                other._modules[name] = child.with_numbers(numbers)
-        return other
 
 
 class Feedback(Controller):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
 import logging
@@ -36,7 +35,7 @@ from ..problem.shapes import check_problem
 from .accuracy import hardest, needed, warn_of_errors, warn_of_models
 from .controller import Carried, Controller, Feedback, Policy
 from .picture import LoopAbout, picture, summary
-from .step import ClosedLoop, LoopState, program, record, row_numbers
+from .step import ClosedLoop, LoopState, program, record
 
 _log = logging.getLogger(__name__)
 _DRAWN_AHEAD = 1024  # steps whose random numbers are drawn at once
@@ -368,15 +367,13 @@ class _LoopRun:
         """Return the result with these rows (R,) of another loop."""
         whole = dataclasses.replace(self, progress=None)
         some = dataclasses.replace(whole, x0=self.x0[rows], seeds=[self.seeds[row] for row in rows.tolist()])
-        alone = not row_numbers(loop)
         try:
-            with some_rows(rows) if alone else contextlib.nullcontext():
-                other, _ = (some if alone else whole).of(loop)
-            known = len(other.state) == (len(rows) if alone else len(self.x0))
+            with some_rows(rows):
+                other, _ = some.of(loop)
+            alone = len(other.state) == len(rows)
         except (RuntimeError, ValueError):
-            known = False
-        if not known:  # the controller has numbers of all rows
             alone = False
+        if not alone:  # the controller has first weights of all rows
             other, _ = whole.of(loop)
         kept, structure = flatten([getattr(result, name) for name in _OF_ROWS])
         new = flatten([getattr(other, name) for name in _OF_ROWS])[0]
@@ -396,7 +393,7 @@ def _run(
 ) -> tuple[LoopResult, LoopState]:
     state: LoopState = over_rows(loop.init, x0)
     pieces: list[list[Tensor]] = []
-    draws, done, numbers = loop.controller.draws, 0, row_numbers(loop)
+    draws, done = loop.controller.draws, 0
     generators = [torch.Generator().manual_seed(seed) for seed in (seeds if draws else ())]
     ahead = max(1, min(_DRAWN_AHEAD, _NUMBERS // (x0.numel() * max(draws, 1))))
     while done < steps:
@@ -404,7 +401,7 @@ def _run(
         count = ahead // every * every if every <= ahead else min(ahead, every - done % every)
         count = min(count, steps - done)
         uniform = uniform_numbers(x0, count, draws, generators)
-        state, out = steps_of(state, uniform, numbers, every=min(every, count))
+        state, out = steps_of(state, uniform, {}, every=min(every, count))
         if done % every == 0:
             pieces.append(flatten(out)[0])
         done += count

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -13,7 +13,7 @@ from ...lanes import Program, shared_program
 from ...lanes.row_numbers import nonzero
 from ...lanes.tree import flatten, unflatten
 from ...numerics.angles import wrap
-from ...numerics.checks import choice, copied, fail, flag, positive_real
+from ...numerics.checks import choice, fail, flag, positive_real
 from ...systems import Plant
 from ..problem.cost import Cost
 from ..problem.held_plant import Holding, Substeps
@@ -83,12 +83,6 @@ class ClosedLoop(nn.Module):
             holding = Holding("ClosedLoop", system, self.cost, self.dt, first, exponential=not self.renew)
         self.holding = holding
 
-    def with_numbers(self, numbers: Mapping[str, Any]) -> Self:
-        """Return a copy whose controller has other numbers: `Controller.with_numbers`."""
-        other = copied(self)
-        other._modules["controller"] = self.controller.with_numbers(numbers)
-        return other
-
     def init(self, x0: Tensor) -> LoopState:
         """The state at time 0 of the rows x0 (B, n)."""
         alive = torch.isfinite(x0).all(-1)
@@ -157,21 +151,14 @@ def program(loop: ClosedLoop, compile: bool) -> Program:
         loop: one step.
         compile: whether to compile it at all; what cannot be compiled runs in plain torch.
     """
-    if not compile:
-        return Program(functools.partial(recorded, loop), name="the closed loop", compile=False)
-    own = row_numbers(loop)  # which come with the row
-    read = loop.with_numbers(dict.fromkeys(own)) if own else loop
     make = functools.partial(functools.partial, recorded)
-    return shared_program("the closed loop", make(loop), read, make=make)
-
-
-def row_numbers(loop: ClosedLoop) -> dict[str, Tensor]:
-    """Return the numbers (B, 1) of which every row has its own: inputs of `program`, by their names."""
-    return {name: value for name, value in loop.controller.numbers().items() if isinstance(value, Tensor)}
+    if not compile:
+        return Program(make(loop), name="the closed loop", compile=False)
+    return shared_program("the closed loop", make(loop), loop, make=make)
 
 
 def recorded(
-    loop: ClosedLoop, state: LoopState, uniform: Tensor, numbers: Mapping[str, Tensor]
+    loop: ClosedLoop, state: LoopState, uniform: Tensor, row: Mapping[str, Tensor]
 ) -> tuple[LoopState, Record]:
     """Return the state after one step, and what is recorded of the time before it.
 
@@ -179,9 +166,9 @@ def recorded(
         loop: one step.
         state: before the step.
         uniform: its random numbers, (B, draws, n).
-        numbers: of `Controller.numbers`, in place of the controller's own.
+        row: nothing.
     """
-    after, u = (loop.with_numbers(numbers) if numbers else loop)(state, uniform)
+    after, u = loop(state, uniform)
     return after, record(loop, state, torch.where(after.alive.unsqueeze(-1), u, torch.nan))
 
 

@@ -10,7 +10,7 @@ from helpers import changed, tensor, uniform
 from helpers_adp import BOX, COST, LAWS, PLANT, learner
 from torch import Tensor
 
-from staf_torch import adp, systems
+from staf_torch import adp, rows, systems
 from staf_torch.adp.critic.bellman import BellmanTerms
 from staf_torch.adp.critic.laws import ActorCriticLaw, Weights, solve_definite
 from staf_torch.numerics.runge_kutta import runge_kutta_step
@@ -34,12 +34,12 @@ ROOT = uniform(B, M, M, seed=5)
 WEIGHTS = Weights(uniform(B, M, seed=6), uniform(B, M, seed=7), ROOT @ ROOT.mT + torch.eye(M).double())
 
 
-def gains_of(rows: bool) -> tuple[adp.Gains, list[dict[str, float]]]:
+def gains_of(own: bool) -> tuple[adp.Gains, list[dict[str, float]]]:
     """The same for all rows, or of each row its own, as the library and as dictionaries."""
-    if not rows:
+    if not own:
         return adp.Gains(**GAINS), [GAINS] * B
     each = [{name: value * (1 + 0.3 * b) for name, value in GAINS.items()} for b in range(B)]
-    columns = {name: tensor([[row[name]] for row in each]) for name in GAINS}
+    columns = {name: rows(tensor([row[name] for row in each])) for name in GAINS}
     return adp.Gains(**columns), each
 
 
@@ -129,18 +129,18 @@ def test_gains_begin_as_published_and_a_law_keeps_what_it_is_given() -> None:
     assert torch.equal(adp.PolicyIteration().init(*start).gain, start[2])
     for name in GAINS:
         assert getattr(adp.Gains(**{name: 0.0}), name) == 0.0
-        for wrong in (-1e-9, tensor([[1.0], [-1.0]])):
+        for wrong in (-1e-9, rows(tensor([1.0, -1.0]))):
             with pytest.raises(ValueError, match=rf"`Gains\({name}=...\)` must not be negative"):
                 adp.Gains(**{name: wrong})
         with pytest.raises(ValueError, match=rf"`Gains\({name}=...\)` must be finite"):
             adp.Gains(**{name: math.inf})
 
 
-@pytest.mark.parametrize("shape", [(3,), (3, 2), (1, 3, 1)])
+@pytest.mark.parametrize("shape", [(3,), (3, 1), (1, 3, 1)])
 def test_gains_of_rows_have_one_number_a_row(shape: tuple[int, ...]) -> None:
-    with pytest.raises(ValueError, match=r"`Gains\(critic=...\)` must be a number or of the shape \(B, 1\)"):
+    with pytest.raises(ValueError, match=r"`Gains\(critic=...\)` must be a number, or `rows` of numbers"):
         adp.Gains(critic=torch.ones(shape))
-    assert adp.Gains(critic=torch.ones(3, 1)).critic.shape == (3, 1)
+    assert adp.Gains(critic=rows(torch.ones(3))).critic.shape == ()
 
 
 @pytest.mark.parametrize("size", [1, 5, 12, 13])

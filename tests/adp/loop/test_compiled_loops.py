@@ -25,6 +25,7 @@ from staf_torch import (
     ball,
     lanes,
     rings,
+    rows,
     systems,
 )
 from staf_torch.lanes.tree import flatten
@@ -148,9 +149,9 @@ def test_a_row_has_the_same_bits_at_every_batch_and_beside_every_neighbour(name:
     case = CASES[name]()
     x0 = states(case, 200)
     whole = fields(run(case, x0, True))[1:]
-    for rows in (1, 7, 64):
-        for one, every in zip(fields(run(case, x0[:rows], True))[1:], whole, strict=True):
-            assert torch.equal(one.nan_to_num(), every[:rows].nan_to_num())
+    for few in (1, 7, 64):
+        for one, every in zip(fields(run(case, x0[:few], True))[1:], whole, strict=True):
+            assert torch.equal(one.nan_to_num(), every[:few].nan_to_num())
     lost = x0.clone()
     lost[1::2] = torch.tensor([float("nan"), 1e300], dtype=torch.float64)
     beside = run(case, lost, True)
@@ -227,16 +228,16 @@ def test_what_cannot_be_compiled_runs_in_plain_torch_with_one_line(
 def test_rows_with_gains_of_their_own_are_compiled_and_are_those_rows_alone(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    x0, critic = uniform(3, 1.0), torch.tensor([[0.1], [0.2], [0.4]], dtype=torch.float64)
+    x0, critic = uniform(3, 1.0), torch.tensor([0.1, 0.2, 0.4], dtype=torch.float64)
 
-    def learned(gain: float | Tensor, rows: slice, compile: bool) -> adp.LoopResult:
+    def learned(gain: float | Tensor, at: slice, compile: bool) -> adp.LoopResult:
         law = adp.Information(adp.Gains(critic=gain))
         controller = adp.ActorCritic(adp.QuadraticBasis(2), PLANT, COST, adp.RandomPoints(1, 1.0), law)
-        return run((controller, PLANT, COST), x0[rows], compile, steps=20, seed=range(3)[rows])
+        return run((controller, PLANT, COST), x0[at], compile, steps=20, seed=range(3)[at])
 
-    whole = learned(critic, slice(0, 3), True)
+    whole = learned(rows(critic), slice(0, 3), True)
     assert PLAIN not in caplog.text
-    plain = learned(critic, slice(0, 3), False)
+    plain = learned(rows(critic), slice(0, 3), False)
     torch.testing.assert_close(whole.actor_weights, plain.actor_weights, rtol=CLOSE, atol=CLOSE)
     for k in range(3):
         alone = learned(float(critic[k]), slice(k, k + 1), False)
