@@ -70,7 +70,7 @@ def rows(numbers: Tensor | Sequence[nn.Module]) -> Any:
         kinds = ", ".join(sorted({type(each).__name__ for each in modules}))
         rule = "must be a tensor (B, ...), as `torch.stack` makes it, or modules of one class"
         raise ValueError(f"`rows(numbers=...)` {rule}; got {kinds or 'none'}.")
-    return _of_all(modules)
+    return merged(modules)
 
 
 def refuse_rows(call: str, **given: Any) -> None:
@@ -110,10 +110,10 @@ def made_by_rows(make: Callable[[], Some]) -> Some:
         found = each_row(make, named=True)
     if not met:
         return found[0]
-    made = _of_all(found)
+    made = merged(found)
     if any(isinstance(tensor, RowNumbers) for tensor in Contents(made).tensors):
         return made
-    return _of_all(found, beside(make))  # as many rows as there are, although all are alike
+    return merged(found, beside(make))  # as many rows as there are, although all are alike
 
 
 class Rowwise(abc.ABCMeta):
@@ -227,7 +227,7 @@ def _with_rows(value: Any, size: int) -> Any:
     return Shared(value) if isinstance(value, Tensor) and value.dim() <= size else value
 
 
-def _of_all(objects: Sequence[Some], other: Some | None = None) -> Some:
+def merged(objects: Sequence[Some], other: Some | None = None) -> Some:
     """Return the object that has the numbers of all rows.
 
     Args:
