@@ -107,6 +107,7 @@ class GradientCall:
         self._shared = [isinstance(leaf, Shared) for leaf in (*given.row, *given.now, *given.carry)]
         self._plans: dict[Any, tuple[Compiled, Plan]] = {}
         self._refused = False
+        self.deciding = program.deciding
 
     def __call__(self, leaves: Sequence[Any]) -> tuple[Any, Any] | None:
         """Return the carry and the outputs, None where the definition must compute them.

@@ -13,16 +13,19 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
+from torch.utils._python_dispatch import TorchDispatchMode
 
+from .call import Given
 from .row_numbers import RowNumbers
 from .trace.step import Step
 from .trace.tracer import NotLoweredError
-from .tree import Tree, flatten, unflatten
+from .tree import Shared, Tree, flatten, plain, unflatten
 
 
 class Differentiated(NamedTuple):
     """What has a gradient, and what one comes from: a flag for every leaf."""
 
+    carry: tuple[bool, ...]  # leaves of the next carry that decide what is wanted
     now: tuple[bool, ...]
     shared: tuple[bool, ...]  # which inputs of a time are alike for all rows
     row: tuple[bool, ...]
@@ -50,8 +53,8 @@ def adjoint_step(
 ) -> Step:
     """Return the step from the gradients by the next carry to those by the carry.
 
-    Its carry is (gradients by the carry's real leaves, sums over times of those by what a row has once and by
-    captured tensors), its inputs of a time (the carry's leaves before, the inputs' leaves, the gradients by
+    Its carry is (gradients by the carry's leaves that matter, sums over times of those by what a row has once
+    and by captured tensors), its inputs of a time (the carry before, leaf by leaf, the inputs, the gradients by
     the outputs that have one), its inputs of a row (their leaves, captured tensors, numbers of rows).
 
     Args:
@@ -63,8 +66,7 @@ def adjoint_step(
 
     def adjoint(carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
         (slopes, sums), (before, brought, ends), (once, found, columns) = carry, now, row
-        moving = [leaf.is_floating_point() for leaf in before]
-        groups = [*zip(before, moving, strict=True), *zip(brought, wanted.now, strict=True)]
+        groups = [*zip(before, wanted.carry, strict=True), *zip(brought, wanted.now, strict=True)]
         groups += [*zip(once, wanted.row, strict=True)]
         given = [leaf for leaf, one in groups if one] + [*found, *columns]
 
@@ -78,13 +80,13 @@ def adjoint_step(
                 after, out = step(*trees)
             if substituted.unmet:
                 raise NotLoweredError("a tensor that requires a gradient is read where nobody sees it")
-            following = [leaf for leaf in flatten(after)[0] if leaf.is_floating_point()]
-            made = zip(flatten(out)[0], wanted.outputs, strict=True)
-            return *following, *(leaf for leaf, one in made if one)
+            made = *flatten(after)[0], *flatten(out)[0]
+            chosen = zip(made, (*wanted.carry, *wanted.outputs), strict=True)
+            return tuple(leaf for leaf, one in chosen if one)
 
         _, pull = torch.func.vjp(forward, *given)[:2]
         found_slopes = iter(pull((*slopes, *ends)))
-        earlier = [next(found_slopes) for one in moving if one]
+        earlier = [next(found_slopes) for one in wanted.carry if one]
         at_times = [
             next(found_slopes).unsqueeze(0) if shared else next(found_slopes)
             for one, shared in zip(wanted.now, wanted.shared, strict=True)
@@ -94,6 +96,49 @@ def adjoint_step(
         return (earlier, total), at_times
 
     return adjoint
+
+
+def deciding(step: Step, given: Given, ends: Sequence[bool], outputs: Sequence[bool]) -> tuple[bool, ...]:
+    """Return which leaves of the carry decide, now or later, what has a gradient: through no others one goes.
+
+    Found out by a step in plain torch, in which loops take all of their passes.
+
+    Args:
+        step: of a program.
+        given: one row and one time.
+        ends: which leaves of the last carry have a gradient.
+        outputs: which outputs have one.
+    """
+    moves = [leaf.is_floating_point() for leaf in given.carry]
+    leaves = [x.detach().requires_grad_(real) for x, real in zip(given.carry, moves, strict=True)]
+    now = [plain(x)[0] if isinstance(x, Shared) else x[:, 0] for x in given.now]
+    with torch.enable_grad(), _Seen():
+        after, out = step(
+            given.tree("carry", leaves), given.tree("now", now), given.tree("row", [*map(plain, given.row)])
+        )
+    following, made = flatten(after)[0], flatten(out)[0]
+    real = [leaf for leaf in leaves if leaf.requires_grad]
+    alive = [end and moving for end, moving in zip(ends, moves, strict=True)]
+    while True:
+        roots = [x for x, one in zip((*following, *made), (*alive, *outputs), strict=True) if one]
+        roots = [root for root in roots if root.requires_grad]
+        ones = [torch.ones_like(root) for root in roots]
+        slopes = torch.autograd.grad(roots, real, ones, True, allow_unused=True) if roots else ()
+        met = iter([slope is not None for slope in slopes] or [False] * len(real))
+        reached = [moving and next(met) for moving in moves]
+        more = [one or found for one, found in zip(alive, reached, strict=True)]
+        if more == alive:
+            return tuple(alive)
+        alive = more
+
+
+class _Seen(TorchDispatchMode):
+    """Context in which nothing but operations is done, as somebody who traces them wants it."""
+
+    def __torch_dispatch__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        return func(*args, **kwargs or {})
 
 
 class Substituted(TorchFunctionMode):

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from .adjoint_steps import Differentiated, adjoint_step
+from .adjoint_steps import Differentiated, Substituted, adjoint_step, deciding
 from .call import Given, fresh, inner_strides
+from .row_independence import undrawn
 from .trace.step import Step
 from .tree import Shared, flatten, plain
 
@@ -44,7 +45,7 @@ class Backward:
     def __init__(
         self, ran: Ran, tensors: Sequence[Tensor], needs: Sequence[bool], ends: Sequence[Tensor | None]
     ) -> None:
-        call, compiled = ran.call, ran.built.compiled
+        call = ran.call
         self._ran, self._call = ran, call
         sizes = (*call.sizes, len(ran.captured), len(ran.numbers))
         given = call.given(tensors[: sum(call.sizes)])
@@ -53,9 +54,9 @@ class Backward:
         self._of_row, self._of_now, self._of_carry, of_captured, of_own = split(needs, sizes)
         self._of_captured = [k for k, need in enumerate(of_captured) if need]
         self._of_own = [k for k, need in enumerate(of_own) if need]
-        self._moves = [dtype.is_floating_point for _, dtype in compiled.carry]
         self._end, self._ends = [*ends[: call.sizes[2]]], [*ends[call.sizes[2] :]]
         self._form = Differentiated(
+            carry=self._deciding(),
             now=tuple(self._of_now),
             shared=tuple(isinstance(leaf, Shared) for leaf in self._now),
             row=tuple(self._of_row),
@@ -78,6 +79,23 @@ class Backward:
         used = [] if self.built is None else self.built.compiled.rows
         places = {id(numbers): k for k, numbers in enumerate(ran.numbers)}
         self._read = [self._own[places[id(numbers)]] for numbers in used]
+
+    def _deciding(self) -> tuple[bool, ...]:
+        """Which leaves of the carry decide what has a gradient."""
+        ends, outputs = ([end is not None for end in each] for each in (self._end, self._ends))
+        known = self._call.deciding.get((*ends, *outputs))
+        if known is None:
+            row = self._some(self._row, slice(0, 1), None)
+            now = self._some(self._now, slice(0, 1), slice(0, 1))
+            given = Given([x[:1] for x in self._carry], now, row, self._call.structures, 1, 1)
+            try:
+                own = {id(n): x[0] for n, x in zip(self._ran.numbers, self._own, strict=True)}
+                with Substituted(own), undrawn():
+                    known = deciding(self._call.program.step, given, ends, outputs)
+            except Exception:  # of a step that is tried otherwise than it runs
+                known = tuple(dtype.is_floating_point for _, dtype in self._ran.built.compiled.carry)
+            self._call.deciding[(*ends, *outputs)] = known
+        return known
 
     def _step(self, program: Program) -> Step:
         """Return the adjoint of a program's step: of the call's, or of that which it follows."""
@@ -121,7 +139,7 @@ class Backward:
         times, carries = iter(at_times), iter(slopes)
         row = [next(totals) if need else None for need in self._of_row]
         now = [next(times) if need else None for need in self._of_now]
-        each = [next(carries) if moves else None for moves in self._moves]
+        each = [next(carries) if decides else None for decides in self._form.carry]
         carry = [x if need else None for x, need in zip(each, self._of_carry, strict=True)]
         captured = [next(totals) if k in self._of_captured else None for k in range(len(self._captured))]
         return [*row, *now, *carry, *captured, *self._numbers(totals)]
@@ -169,8 +187,8 @@ class Backward:
 
     def _slopes(self, rows: slice) -> list[Tensor]:
         """Gradients by the carry after the last time."""
-        triples = zip(self._carry, self._end, self._moves, strict=True)
-        return [torch.zeros_like(x[rows]) if end is None else end[rows] for x, end, moves in triples if moves]
+        triples = zip(self._carry, self._end, self._form.carry, strict=True)
+        return [torch.zeros_like(x[rows]) if end is None else end[rows] for x, end, one in triples if one]
 
     def _carries(self, rows: slice, times: slice, begin: Sequence[Tensor], every: int) -> list[Tensor]:
         """The carry before times of some rows, computed again."""

@@ -79,6 +79,7 @@ class Trace(NamedTuple):
     outputs: tuple[tuple[torch.Size, torch.dtype], ...]
     structure: Any
     rows: tuple[RowNumbers, ...]
+    times: tuple[int, ...]  # inputs of a time that anything depends on
 
 
 def place(*described: object) -> Path:

@@ -22,7 +22,7 @@ def written(step: Step, given: Given, form: Form) -> Trace:
     if not isinstance(form, int):
         traced = trace(step, given)
         text = kernel(traced, given)
-        return Trace(text, traced.recipe, real, traced.outputs, traced.structure, traced.rows)
+        return _record(text, traced, real)
     try:
         traced = trace(step, given)
         text = emit(*traced.program, form)
@@ -33,7 +33,13 @@ def written(step: Step, given: Given, form: Form) -> Trace:
         real = torch.float64
         traced = trace(step, given, widened=True)
         text = emit(*traced.program, form)
-    return Trace(text, traced.recipe, real, traced.outputs, traced.structure, traced.rows)
+    return _record(text, traced, real)
+
+
+def _record(text: Text, traced: Traced, real: torch.dtype) -> Trace:
+    graph, _, following, outputs = traced.program
+    times = graph.slots("now", [*following, *outputs])
+    return Trace(text, traced.recipe, real, traced.outputs, traced.structure, traced.rows, times)
 
 
 def kernel(traced: Traced, given: Given) -> Text:

@@ -101,6 +101,23 @@ class Graph:
             self._signed.append(self._may_be_negative_zero(found))
         return found
 
+    def slots(self, op: str, ends: Sequence[int]) -> tuple[int, ...]:
+        """The inputs of a kind that some nodes depend on."""
+        stack, seen, found = [*ends], set[int](), set[int]()
+        while stack:
+            node = stack.pop()
+            if node in seen:
+                continue
+            seen.add(node)
+            stack += self.args[node]
+            if self.op[node] == op:
+                found.add(self.aux[node][0])
+            elif self.op[node] == "loop":
+                loop = self.loops[self.aux[node]]
+                inside = [*loop.following, *loop.condition, *(n for part in loop.collected for n in part)]
+                stack += [*loop.initial, *inside]
+        return tuple(sorted(found))
+
     def constant(self, value: float | bool, type: str) -> int:
         """The node of a number."""
         if type == FLAG:
