@@ -54,8 +54,8 @@ def adjoint_step(
     """Return the step from the gradients by the next carry to those by the carry.
 
     Its carry is (gradients by the carry's leaves that matter, sums over times of those by what a row has once
-    and by captured tensors), its inputs of a time (the carry before, leaf by leaf, the inputs, the gradients by
-    the outputs that have one), its inputs of a row (their leaves, captured tensors, numbers of rows).
+    and by captured tensors), its inputs of a time (the carry before, leaf by leaf, the inputs, the gradients
+    by the outputs that have one), its inputs of a row (their leaves, captured tensors, numbers of rows).
 
     Args:
         step: of a program.
