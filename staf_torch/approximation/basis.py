@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from ..centers import StateFollowingCenters
 from ..kernels import Kernel
+from ..lanes.one_thread import small
 from ..lanes.row_numbers import over_rows
 from ..lanes.row_objects import Rowwise
 from ..local_basis import Degrees, LocalBasis, LocalSpace
@@ -92,6 +93,7 @@ class StaFBasis(nn.Module, metaclass=Rowwise):
     _choose_again = False  # whether directions came without what fixes their local basis
     convention: Tensor
 
+    @small
     def __init__(self, kernel: Kernel, centers: StateFollowingCenters) -> None:
         super().__init__()
         if not isinstance(kernel, Kernel):

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from ..lanes.gradients import refuse_gradient
+from ..lanes.one_thread import alone
 from ..numerics.checks import choice, fail, flag, hold, integer, trailing
 from ..numerics.default_device import beside
 from ..numerics.linalg import row_jacobian
@@ -148,7 +149,7 @@ class StaF(nn.Module):
         refuse_gradient("StaF.fit_", x=x, target=target)
         if x.numel():
             check_target(target, x, self.out_features)
-        with torch.no_grad():
+        with torch.no_grad(), alone(x[..., 0].numel() * self.basis.count**2):
             x = _wide(x.to(self.state))
             self.basis.check_reach(x)
             coefficients = self.basis.local(x).fit(self.basis.values(x, target, self.out_features))

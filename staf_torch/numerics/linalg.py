@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..lanes.one_thread import alone
+from ..lanes.one_thread import alone, small_in_scipy
 from .checks import fail, positive_real, real, vector
 from .default_device import designed_on_cpu
 
@@ -149,7 +149,7 @@ def solver(name: str) -> Callable[..., Any]:
             "pip install 'staf_torch[adp]'."
         ) from error
     found: Callable[..., Any] = getattr(scipy.linalg, name)
-    return found
+    return small_in_scipy(found)
 
 
 @designed_on_cpu

@@ -12,6 +12,7 @@ from torch.nn.functional import pad
 
 from ...lanes.contents import is_users, version
 from ...lanes.gradients import gradients_of, marked
+from ...lanes.one_thread import small
 from ...lanes.row_numbers import over_rows
 from ...lanes.row_objects import OfRows
 from ...numerics.checks import real, trailing
@@ -207,6 +208,7 @@ class LQR(nn.Module, metaclass=OfRows):
     rowwise: ClassVar = {"forward": (1,), "value": (1,)}
 
     @beside
+    @small
     def __init__(self, system: Plant, cost: Cost, period: float | None = None) -> None:
         super().__init__()
         self.layers = gradients_of("LQR", system=system, cost=cost)

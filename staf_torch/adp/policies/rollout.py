@@ -16,6 +16,7 @@ from ...kernels import ExponentialKernel, GaussianKernel, Kernel
 from ...lanes import call, compiled, each, repeat
 from ...lanes.call import PlannedCall
 from ...lanes.compiled_methods import Rows, check_states
+from ...lanes.one_thread import small
 from ...lanes.prepared import Plan
 from ...lanes.row_objects import refuse_rows
 from ...numerics.checks import fail, integer, positive_real, trailing
@@ -78,6 +79,7 @@ class RolloutPolicy(nn.Module):
     """
 
     @beside
+    @small
     def __init__(
         self,
         basis: StaFBasis,

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from ...lanes.gradients import without_gradient
+from ...lanes.one_thread import small
 from ...numerics.checks import fail, positive_real
 from ...numerics.default_device import designed_on_cpu
 from ...numerics.differences import STEP, central_slopes
@@ -158,6 +159,7 @@ class HeldStability(NamedTuple):
 
 @without_gradient("held_stability", "policy", "system", "at")
 @Sign("held_stability")
+@small
 def held_stability(
     policy: Callable[[Tensor], Tensor], system: Plant, period: float, *, at: Tensor | None = None
 ) -> HeldStability:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ...lanes import compiled, repeat, where_rows
 from ...lanes.gradients import gradients_of, marked
+from ...lanes.one_thread import small
 from ...numerics.checks import fail, one_or_each, positive, positive_real, trailing
 from ...numerics.default_device import beside, device_of
 from ...numerics.shown import limits, shown
@@ -137,6 +138,7 @@ class SafetyFilter(Controller):
     }
 
     @beside
+    @small
     def __init__(
         self,
         policy: Policy | Controller,
