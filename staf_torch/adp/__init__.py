@@ -55,7 +55,7 @@ from .planning.shooting import Optimum as Optimum
 from .policies.energy_shaping import EnergyShaping as EnergyShaping
 from .policies.path_integral import PathIntegral as PathIntegral
 from .policies.rollout import RolloutPolicy as RolloutPolicy
-from .problem.cost import BoundedInputCost as BoundedInputCost
+from .problem.bounded_input_cost import BoundedInputCost as BoundedInputCost
 from .problem.cost import Cost as Cost
 from .problem.cost import QuadraticCost as QuadraticCost
 from .problem.held_linear import held_stability as held_stability

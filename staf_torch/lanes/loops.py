@@ -371,7 +371,7 @@ def _loop(
     _place(tracer, loop, number)
     results, done = [], 0
     for leaf in given:
-        nodes = _numbers(tracer, "result", (loop.node,), (number, done), leaf)
+        nodes = _numbers(tracer, "result", (loop.node,), (number, done), leaf, None)
         if leaf.numel() <= LARGE:  # what a pass finds without the carry of another, all passes find alike
             ends = loop.following[done : done + len(nodes)]
             nodes = [e if graph.depth[e] < loop.depth else n for e, n in zip(ends, nodes, strict=True)]
@@ -383,12 +383,7 @@ def _loop(
 
 
 def _numbers(
-    tracer: Tracer,
-    op: str,
-    args: tuple[int, ...],
-    first: tuple[int, int],
-    leaf: Tensor,
-    depth: int | None = None,
+    tracer: Tracer, op: str, args: tuple[int, ...], first: tuple[int, int], leaf: Tensor, depth: int | None
 ) -> list[int]:
     """New nodes of what passes through a loop: one a number, or the entries of one array of many."""
     graph, kind, size, (number, start) = tracer.graph, tracer.kind(leaf.dtype), leaf.numel(), first
@@ -443,12 +438,10 @@ def _place(tracer: Tracer, loop: Loop, number: int) -> None:
     free, seen, stack = set(loop.initial), set(), ends
     while stack:
         node = stack.pop()
-        if node in seen:
-            continue
-        seen.add(node)
         if graph.depth[node] < loop.depth:
             free.add(node)
-        else:
+        elif node not in seen:
+            seen.add(node)
             stack += graph.args[node]
     loop.home = max((graph.depth[node] for node in free), default=0)
     loop.node = graph.add("loop", sorted(free), "none", number, loop.home)

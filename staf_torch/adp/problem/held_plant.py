@@ -385,9 +385,8 @@ class Holding:
         low, high = (-none, none) if bounds is None else (bounds.low.double(), bounds.high.double())
         rate, columns = plant.motion(x, u), []
         for k in range(u.shape[-1]):  # as far as a loop may go in a period
-            pushed = (
-                plant.motion(x, u + torch.eye(len(still), dtype=torch.float64, device=still.device)[k]) - rate
-            )
+            one = torch.eye(len(still), dtype=torch.float64, device=still.device)[k]
+            pushed = plant.motion(x, u + one) - rate
             push = float(pushed.abs().amax(-1).nan_to_num(0.0, 0.0).quantile(0.5))
             width = _MOVED * plant.spread / (self.dt * push) if push > 0 else 1.0
             least, most = (

@@ -19,7 +19,8 @@ from ....signs import Sign
 from ....systems import ControlAffineSystem, Linear, Plant
 from ....systems.bounds import Limit
 from ...loop.controller import LQR, Policy, Value
-from ...problem.cost import BoundedInputCost, Cost, QuadraticCost, quadratic
+from ...problem.bounded_input_cost import BoundedInputCost
+from ...problem.cost import Cost, QuadraticCost, quadratic
 from ...problem.rules import (
     check_regulates,
     check_still,
@@ -32,7 +33,7 @@ from ...problem.shapes import check_policy, check_problem, check_value
 from ..trajectories import Trajectories, chosen
 from .merging import ROWS, cheapest, joined, merged, selected
 from .mesh import graded, halved, split
-from .newton import Interval, MeshPlan, NewtonSolution, follow, minimise, replay
+from .newton import Interval, MeshPlan, NewtonSolution, follow, minimise, replay, why_none
 from .optimum import Optimum
 from .plan_search import PlanSearch
 from .starts import guesses, guided
@@ -423,7 +424,7 @@ class DirectShooting:
             converged=known,
             plan=where_known(nodes),
             optimality=torch.where(rest, 0.0, left),
-            reason=tuple(_why(bool(known[b]), fine, float(left[b]), b) for b in range(len(x0))),
+            reason=tuple(why_none(bool(known[b]), fine, float(left[b]), b) for b in range(len(x0))),
         )
 
     def _left(self, solution: NewtonSolution, time: Tensor) -> Tensor:
@@ -438,20 +439,6 @@ class DirectShooting:
 def _always(policy: Policy) -> Callable[[Tensor, float], Tensor]:
     """A policy as a control u(x, t)."""
     return lambda x, t: policy(x)
-
-
-def _why(known: bool, solution: NewtonSolution, left: float, row: int) -> str:
-    """Why a row has no optimum, in words; empty where it has."""
-    if known:
-        return ""
-    if not bool(torch.isfinite(solution.plan.cost[row])):
-        return "the cost is not finite from here under any start: give a `base` that does not diverge"
-    if not bool(solution.converged[row]):
-        promise = float(solution.promise[row])
-        if not math.isfinite(promise):
-            return "not stationary: the expansion around the last trajectory is not finite or has no minimum"
-        return f"not stationary: the last model promised {promise:.2g} of the value"
-    return f"the control misses the minimum of the Hamiltonian by {left:.2g} of the value: it is saturated"
 
 
 def _rates(system: Plant, lqr: LQR) -> tuple[float, float]:

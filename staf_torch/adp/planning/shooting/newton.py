@@ -11,6 +11,7 @@ Source: Dunn and Bertsekas, JOTA 63 (1989).
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
@@ -21,7 +22,8 @@ from ....numerics.linalg import row_jacobian, slope_of
 from ....numerics.riccati import riccati_step
 from ....numerics.runge_kutta import SHARES, runge_kutta_mean, runge_kutta_stages, runge_kutta_step
 from ....systems import ControlAffineSystem, Plant
-from ...problem.cost import BoundedInputCost, Cost
+from ...problem.bounded_input_cost import BoundedInputCost
+from ...problem.cost import Cost
 from ..trajectories import chosen
 
 _ROUNDING = 1e-9  # relative promise below which a step that does not pay is one that rounding hides
@@ -384,3 +386,17 @@ def _derivatives(value: Callable[[Tensor], Tensor], x: Tensor) -> tuple[Tensor, 
         rows = [slope_of(s, at) for s in slope.unbind(-1)]
     curvature = torch.stack(rows, dim=-2)
     return slope.detach(), 0.5 * (curvature + curvature.mT)
+
+
+def why_none(known: bool, solution: NewtonSolution, left: float, row: int) -> str:
+    """Why a row has no optimum, in words; empty where it has."""
+    if known:
+        return ""
+    if not bool(torch.isfinite(solution.plan.cost[row])):
+        return "the cost is not finite from here under any start: give a `base` that does not diverge"
+    if not bool(solution.converged[row]):
+        promise = float(solution.promise[row])
+        if not math.isfinite(promise):
+            return "not stationary: the expansion around the last trajectory is not finite or has no minimum"
+        return f"not stationary: the last model promised {promise:.2g} of the value"
+    return f"the control misses the minimum of the Hamiltonian by {left:.2g} of the value: it is saturated"
