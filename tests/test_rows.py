@@ -5,6 +5,8 @@ from __future__ import annotations
 import copy
 import pickle
 import random
+import sys
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -223,3 +225,124 @@ def test_numbers_of_rows_survive_copies_casts_and_pickles() -> None:
     assert "rows(" in repr(systems.Pendulum(mass=st.rows(spread(1.0, 2.0)))) + repr(
         st.GaussianKernel(st.rows(spread(1.0, 2.0)))
     )
+
+
+@pytest.mark.parametrize("scaling", [False, True])
+def test_streams_with_a_width_and_a_noise_of_their_own_are_streams_alone(scaling: bool) -> None:
+    ends = {"radius": (0.3, 0.6), "noise": (0.03, 0.1), "amplitude": (0.8, 1.5), "forgetting": (0.99, 0.999)}
+    numbers = {name: spread(*each) for name, each in {**ends, "follow": (0.5, 1.0), "robust": (2, 3)}.items()}
+    widths = spread(0.6, 1.2)
+    own = {name: st.rows(column) for name, column in numbers.items()}
+    many = st.StaFRegressor(st.GaussianKernel(st.rows(widths)), scaling=scaling, **own)
+    one = {name: float(column[1]) for name, column in numbers.items()}
+    alone = st.StaFRegressor(st.GaussianKernel(float(widths[1])), scaling=scaling, **one)
+    for k in range(45):
+        x = torch.stack(
+            [torch.tensor(0.05 * k + s).sin() * torch.tensor([1.0, 0.7]) for s in range(FEW)]
+        ).double()
+        y = (2 * x).sin().sum(-1)
+        many.partial_fit(x, y)
+        alone.partial_fit(x[1:2], y[1:2])
+    for found, wanted in zip(many.predict(x, True), alone.predict(x[1:2], True), strict=True):
+        torch.testing.assert_close(found[1:2], wanted, rtol=1e-9, atol=1e-9)
+    with pytest.raises(ValueError, match=r"a batch of 2 rows met numbers of `rows\(\.\.\.\)` for 3"):
+        st.StaFRegressor(radius=st.rows(spread(0.3, 0.6))).partial_fit(x[:2], y[:2])
+
+
+def test_another_mass_gain_or_step_needs_neither_a_trace_nor_a_compiler() -> None:
+    x0 = torch.tensor([[0.5, 0.1]]).double().expand(2, 2)
+    cost, states = adp.QuadraticCost(1.0, 1.0, 2, 1), x0.unsqueeze(1).expand(2, 20, 2)
+    basis = st.StaFBasis(st.GaussianKernel(0.7), st.StateFollowingCenters(st.rings(3), 0.3))
+
+    def calls(run: Callable[[], object], name: str) -> int:
+        """How often a method of this name is called meanwhile."""
+        count = 0
+
+        def seen(frame: Any, event: str, _: object) -> None:
+            nonlocal count
+            count += event == "call" and frame.f_code.co_name == name
+
+        before = sys.getprofile()
+        sys.setprofile(seen)
+        try:
+            run()
+        finally:
+            sys.setprofile(before)
+        return count
+
+    plants = {m: systems.VanDerPol(damping=m) for m in (1.0, 2.0, -0.5)}
+    laws = {step: optim.FixedStep(step) for step in (0.5, 0.9, 0.25)}
+    discounts = {rho: adp.QuadraticCost(1.0, 1.0, 2, 1, discount=rho) for rho in (0.5, 1.0, 0.25)}
+    lqr = adp.LQR(systems.Pendulum(), cost)
+    with lanes.compiling("always"):
+        for run, of, method in (
+            (lambda v: systems.simulate(plants[v], x0, dt=0.01, steps=5), plants, "drift"),
+            (lambda v: st.chase_weights(states, basis, st.targets.Paper(), laws[v]), laws, "descent"),
+            (
+                lambda v: adp.simulate(lqr, systems.Pendulum(), discounts[v], x0, steps=5, substeps=1),
+                discounts,
+                "stage_weights",
+            ),
+        ):
+            first, *others = of
+            run(first)
+            for other in others:
+                assert calls(lambda run=run, other=other: run(other), method) == 0
+
+
+@pytest.mark.parametrize(
+    "read",
+    [
+        lambda k: float(f"{k:.6f}"),
+        lambda k: k.tolist(),
+        lambda k: float(k.numpy()),
+        lambda k: torch.tensor([[k, 1.0]])[0, 0],
+        float,
+    ],
+)
+def test_a_number_that_a_step_takes_out_of_torch_is_never_stale(read: Callable[[Tensor], Any]) -> None:
+    class Reads(Spring):
+        def drift(self, x: Tensor) -> Tensor:
+            k = read(self.get_buffer("stiffness"))
+            return torch.stack((x[..., 1], -k * x[..., 0]), dim=-1)
+
+    x0 = torch.tensor([[1.0, 0.0]]).double()
+    for stiffness in (1.0, 2.0):
+        plant = Reads(torch.tensor(stiffness))
+        with lanes.compiling("always"):
+            found = systems.simulate(plant, x0, dt=0.01, steps=5)
+        with lanes.compiling("never"):
+            torch.testing.assert_close(found, systems.simulate(plant, x0, dt=0.01, steps=5))
+
+
+def test_numbers_that_are_equal_in_all_rows_are_of_as_many_rows() -> None:
+    x = torch.randn(4, 2).double()
+    for rows in (1, 3):
+        equal = torch.full((rows,), 0.5).double()
+        basis = st.StaFBasis(st.GaussianKernel(0.7), st.StateFollowingCenters(st.rings(3), 0.3))
+        for law in (optim.FixedStep(st.rows(equal)), optim.HeavyBall(1.0, st.rows(equal))):
+            with pytest.raises(ValueError, match=f"a batch of 4 rows met numbers of .* for {rows}"):
+                st.chase_weights(x.unsqueeze(1), basis, st.targets.Paper(), law)
+
+
+ANYWHERE: dict[str, Callable[[Any], Callable[[Tensor], Tensor]]] = {
+    "repeat": lambda k: lambda x: lanes.repeat(2, lambda c: c * k.sin(), x),
+    "torch.tensor": lambda k: lambda x: x * torch.tensor([k, 1.0]),
+    "new_full": lambda k: lambda x: x + x.new_full(x.shape[1:], k),
+    "derivative": lambda k: lambda x: torch.func.grad(lambda y: (k * y.sin()).sum())(x),
+    "branch": lambda k: lambda x: x * 2 if k > 1.5 else x,
+    "constructor": lambda k: lambda x: systems.Pendulum(mass=k).drift(x),
+}
+
+
+@pytest.mark.parametrize("name", ANYWHERE)
+def test_a_users_function_may_read_numbers_of_rows_wherever_torch_takes_numbers(name: str) -> None:
+    numbers, x = spread(1.0, 2.0), torch.randn(FEW, 2).double()
+    function = ANYWHERE[name](st.rows(numbers))
+    program = lanes.Program(lambda c, _, row: (c, function(row)))
+    singles = [ANYWHERE[name](k)(x[row : row + 1]) for row, k in enumerate(numbers)]
+    for run in (program, program.definition):
+        torch.testing.assert_close(
+            run((), (), x, steps=1)[1][:, 0], torch.cat(singles), rtol=1e-14, atol=1e-14
+        )
+    assert program.compiled == (name not in ("new_full", "branch"))  # which want a Python number

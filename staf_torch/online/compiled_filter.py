@@ -13,8 +13,9 @@ import torch
 from torch import Tensor
 
 from ..lanes.compiler import compiled
-from .kalman_filter import LocalFilter, StreamState
+from .kalman_filter import LocalFilter, StreamState, blocks_of
 from .local_functions import LocalFunctions
+from .own_functions import OwnFunctions
 from .samples import in_place
 
 NATIVE = Path(__file__).with_name("native")
@@ -68,6 +69,33 @@ class StreamsInC(ctypes.Structure):
     )
 
 
+class OwnStreamsInC(ctypes.Structure):
+    """`Streams` of _filter.cpp with numbers of a stream's own."""
+
+    _fields_ = (
+        ("streams", ctypes.c_int64),
+        ("stride", ctypes.c_int64),
+        ("closed", ctypes.c_int64),
+        *((name, ctypes.c_void_p) for name in ("table", "counts", "ratio", "forgetting")),
+        *((name, ctypes.c_void_p) for name in ("offsets", "squares", "newton", "gram")),
+        *((name, ctypes.c_void_p) for name in ("rate", "reach", "slack2", "robust", "base")),
+        *((name, ctypes.c_double) for name in ("tiny", "most")),
+    )
+
+
+def _own_columns(definition: LocalFilter, functions: OwnFunctions) -> list[Tensor]:
+    """Return numbers of all streams as _filter.cpp reads them: (blocks, numbers, `LANES`)."""
+    squares = functions.offsets.square().sum(1)
+    reach = squares.amax(0).clamp(min=1e-300).sqrt()
+    law = (definition.slack, definition.robust, definition.base)
+    slack, robust, base = (torch.as_tensor(part, device="cpu").double().expand_as(reach) for part in law)
+    parts = (functions.offsets, squares, functions.shared, functions.gram, functions.rate, reach)
+    return [
+        blocks_of(part.reshape(-1, len(reach)), padding=1.0)
+        for part in (*parts, slack.square(), robust, base)
+    ]
+
+
 _packed = struct.Struct("7q").pack  # `Given` of _filter.cpp: what belongs to a call alone
 
 
@@ -81,14 +109,23 @@ class CompiledFilter:
     """
 
     def __init__(self, definition: LocalFilter, state: StreamState, call: Callable[..., None]) -> None:
-        pointers, self._held = FunctionPointers.of(definition.functions)
         ratio, forgetting = definition.ratio.contiguous(), definition.forgetting.contiguous()
-        self._held += [state.blocks, state.counts, ratio, forgetting]
-        streams = state.streams
+        self._held = [state.blocks, state.counts, ratio, forgetting]
+        streams, functions = state.streams, definition.functions
         numbers = torch.finfo(state.dtype)
-        places = [each.data_ptr() for each in (state.blocks, state.counts, ratio, forgetting)]
-        law = definition.slack**2, definition.robust, definition.base, numbers.eps**0.5, numbers.max
-        self._streams = StreamsInC(streams, streams, 0, *places, pointers, *law)
+        places = [each.data_ptr() for each in self._held]
+        limits = numbers.eps**0.5, numbers.max
+        self._streams: StreamsInC | OwnStreamsInC
+        if isinstance(functions, OwnFunctions):
+            own = _own_columns(definition, functions)
+            self._held += own
+            columns = [each.data_ptr() for each in own]
+            self._streams = OwnStreamsInC(streams, streams, 0, *places, *columns, *limits)
+        else:
+            pointers, held = FunctionPointers.of(functions)
+            self._held += held
+            law = float(definition.slack) ** 2, float(definition.robust), float(definition.base)
+            self._streams = StreamsInC(streams, streams, 0, *places, pointers, *law, *limits)
         self._run, self.reference = call, ctypes.addressof(self._streams)
         # the same function, called without giving Python's lock away
         address = ctypes.cast(call, ctypes.c_void_p).value  # type: ignore[arg-type]
@@ -100,11 +137,12 @@ class CompiledFilter:
     def build(cls, definition: LocalFilter, state: StreamState) -> CompiledFilter | LocalFilter:
         """The compiled filter, or the definition where there is none."""
         functions, real = definition.functions, _REALS.get(state.dtype)
-        plain = functions.rate is not None and functions.shared is not None and functions.stationary
+        own = isinstance(functions, OwnFunctions)
+        plain = own or (functions.rate is not None and functions.shared is not None and functions.stationary)
         if not plain or real is None or state.count > _MOST or state.blocks.device.type != "cpu":
             return definition
         sizes = f"DIM={state.dim}", f"COUNT={state.count}", f"OUTPUTS={state.outputs}"
-        call = compiled(NATIVE / "_filter.cpp", *sizes, f"REAL={real}")
+        call = compiled(NATIVE / "_filter.cpp", *sizes, f"REAL={real}", *(["OWN=1"] if own else []))
         return definition if call is None else cls(definition, state, call)
 
     def close(self, closed: bool) -> None:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from .compiled_filter import CompiledFilter, DirectCalls
 from .kalman_filter import STREAK, LocalFilter, StreamState
+from .own_functions import OwnFunctions
 
 LEARNED_AT = (2, 5, 10, 20, 40)  # samples after which the units are learned
 OUTLYING = 30.0  # median deviations beyond which a value has no say in them
@@ -235,7 +236,7 @@ class FilterStreams:
         center, spread = self.units[rows].unsqueeze(1).split(wide, dim=-1)
         u = ((samples[..., :wide] - center) / spread).to(self.dtype)
         alone = StreamState.empty(self.state.blocks, len(rows), *self.state.sizes)
-        law = self.definition.with_law(self.definition.ratio[rows], self.definition.forgetting[rows])
+        law = self.definition.of_rows(rows)
         filter_ = CompiledFilter.build(law, alone)
         for k in range(u.shape[1]):
             before = alone.counts[0].clone()
@@ -265,7 +266,13 @@ class FilterStreams:
         self._calm = False
 
     def add(self, streams: int) -> None:
-        """Begin further streams, behind the others."""
+        """Begin further streams, behind the others.
+
+        Raises:
+            ValueError: if the streams have numbers of their own.
+        """
+        if isinstance(self.definition.functions, OwnFunctions):
+            raise ValueError("streams with numbers of `rows(...)` are as many as these: none can be added.")
         fresh = StreamState.empty(self.state.blocks, streams, *self.state.sizes)
         table = torch.cat((self.state.table, fresh.table), 1)
         state = self.state.with_table(table, torch.cat((self.state.counts, fresh.counts), 1))
@@ -283,8 +290,7 @@ class FilterStreams:
         state = self.state.with_table(self.state.table[:, rows], self.state.counts[:, rows])
         for name in ("units", "first", "clock", "turn", "_known", "_stretch", "_may_grow"):
             setattr(self, name, getattr(self, name)[rows])
-        old = self.definition
-        self._hold(old.with_law(old.ratio[rows], old.forgetting[rows]), state)
+        self._hold(self.definition.of_rows(rows), state)
 
     def state_dict(self) -> dict[str, Any]:
         """Copies of all tensors that learning changes, and what the local functions are told by."""
@@ -292,9 +298,7 @@ class FilterStreams:
 
     def _fixed(self) -> dict[str, Tensor]:
         """Return the tensors that a loaded state must share: the centers, and the kernel at them."""
-        functions = self.definition.functions
-        zero, offsets = torch.zeros_like(functions.offsets[0]), functions.offsets
-        return {"offsets": offsets, "gram": functions.kernel.core(zero, offsets, offsets).detach()}
+        return self.definition.functions.fixed()
 
     def _learned(self) -> dict[str, Tensor]:
         """All tensors that learning changes."""

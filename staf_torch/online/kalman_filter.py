@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from .local_functions import LocalFunctions
+from .own_functions import OwnFunctions
 
 SURPRISE = 25.0  # squared errors count at most so many times their running mean, each in a row so many more
 LANES = 8  # streams whose numbers stand together: the double precision numbers of a vector register
@@ -44,11 +45,11 @@ class StreamState:
         table = like.new_zeros(rows_of(dim, count, outputs), streams)
         table[: 2 * dim] = torch.nan
         counts = torch.zeros(4, streams, dtype=torch.int64, device=like.device)
-        return cls(_blocks(table), counts, dim, count, outputs)
+        return cls(blocks_of(table), counts, dim, count, outputs)
 
     def with_table(self, table: Tensor, counts: Tensor) -> StreamState:
         """Other streams of these sizes."""
-        return dataclasses.replace(self, blocks=_blocks(table), counts=counts.contiguous())
+        return dataclasses.replace(self, blocks=blocks_of(table), counts=counts.contiguous())
 
     @property
     def streams(self) -> int:
@@ -67,7 +68,7 @@ class StreamState:
 
     def put(self, table: Tensor) -> None:
         """Take these numbers, (rows, S)."""
-        self.blocks.copy_(_blocks(table.to(self.blocks)))
+        self.blocks.copy_(blocks_of(table.to(self.blocks)))
 
     @property
     def sizes(self) -> tuple[int, int, int]:
@@ -181,21 +182,27 @@ class LocalFilter:
         functions: the local functions.
         ratio: rho, variance of the noise in units of the process's, (S,).
         forgetting: lambda, in (0, 1], for a step of time 1, (S,).
-        slack: distance from the anchor at which the centers follow.
+        slack: distance from the anchor at which the centers follow; this and the next may be (S,).
         robust: standard deviations beyond which an error counts no more than there (Huber); inf for none.
         base: variance of the process in the units of y, before there are errors to tell.
     """
 
-    functions: LocalFunctions
+    functions: LocalFunctions | OwnFunctions
     ratio: Tensor
     forgetting: Tensor
-    slack: float
-    robust: float = math.inf
-    base: float = 1.0
+    slack: float | Tensor
+    robust: float | Tensor = math.inf
+    base: float | Tensor = 1.0
 
     def with_law(self, ratio: Tensor, forgetting: Tensor) -> LocalFilter:
         """The filter for other streams, with these rho and lambda (S,)."""
         return dataclasses.replace(self, ratio=ratio, forgetting=forgetting)
+
+    def of_rows(self, rows: Tensor) -> LocalFilter:
+        """The filter of the streams with these numbers."""
+        own = {name: getattr(self, name) for name in ("ratio", "forgetting", "slack", "robust", "base")}
+        some = {name: part[rows] for name, part in own.items() if isinstance(part, Tensor)}
+        return dataclasses.replace(self, functions=self.functions.of_rows(rows), **some)
 
     def predict(self, state: StreamState, x: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of the next y at x (S, n): (S, K), (S, K)."""
@@ -381,10 +388,10 @@ def rows_of(dim: int, count: int, outputs: int) -> int:
     return 2 * dim + (outputs + 1) * count + count * (count + 1) // 2 + 7 * outputs + 2
 
 
-def _blocks(table: Tensor) -> Tensor:
-    """(rows, S) -> (ceil(S / LANES), rows, LANES), zeros behind the last stream."""
+def blocks_of(table: Tensor, padding: float = 0.0) -> Tensor:
+    """(rows, S) -> (ceil(S / LANES), rows, LANES), ``padding`` behind the last stream."""
     short = -table.shape[1] % LANES
-    padded = torch.nn.functional.pad(table, (0, short))
+    padded = torch.nn.functional.pad(table, (0, short), value=padding)
     blocks: Tensor = padded.unflatten(1, (-1, LANES)).transpose(0, 1).contiguous()
     return blocks
 

@@ -43,6 +43,15 @@ class LocalFunctions(NamedTuple):
         pairs = None if rate is None else (gram.unsqueeze(1) * shared.mT).flatten(0, 1)
         return cls(kernel, offsets, shared, rate, pairs)
 
+    def of_rows(self, rows: Tensor) -> LocalFunctions:
+        """Those of some streams: these."""
+        return self
+
+    def fixed(self) -> dict[str, Tensor]:
+        """Return the tensors that a loaded state must share: the centers, and the kernel at them."""
+        zero = torch.zeros_like(self.offsets[0])
+        return {"offsets": self.offsets, "gram": self.kernel.core(zero, self.offsets, self.offsets).detach()}
+
     def functions(self, x: Tensor, z: Tensor) -> Tensor:
         """psi at x + z: (n, S), (n, S) -> (M, S), in the dtype of z."""
         wide = z.double()

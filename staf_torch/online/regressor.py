@@ -22,6 +22,7 @@ from .estimator import StreamEstimator, Streams
 from .filter_streams import FilterStreams
 from .kalman_filter import LocalFilter, StreamState
 from .local_functions import LocalFunctions
+from .own_functions import NAMES, has_rows, own_functions, own_law
 from .samples import lapses, like_given, pair, tensor_of
 from .smoothing import smooth_record
 from .tuning import Tuning, tuned_streams, tuning
@@ -72,6 +73,8 @@ class StaFRegressor(StreamEstimator):
         periodic: coordinates of x that are angles in rad: a sample is turned by whole turns to within pi of
             the latest of its stream. `MixtureRegressor` has none: give it sine and cosine.
         robust: standard deviations beyond which an error counts no more than there (Huber); None for any.
+            Numbers of the kernel, ``radius``, ``noise``, ``amplitude``, ``forgetting``, ``follow`` and
+            ``robust`` may be one a stream, by `staf_torch.rows`, of a Gaussian kernel.
         scaling: whether x and y are brought to mean 0 and variance 1, learned from the first 40 samples. Then
             radius, noise and amplitude are in these units.
 
@@ -93,16 +96,16 @@ class StaFRegressor(StreamEstimator):
     def __init__(
         self,
         kernel: Kernel | str = "gaussian",
-        radius: float = 0.5,
+        radius: float | Tensor = 0.5,
         count: int | None = None,
         *,
         centers: Any = None,
-        noise: float = 1e-2,
-        amplitude: float = 1.0,
-        forgetting: float = 0.999,
-        follow: float = 1.0,
+        noise: float | Tensor = 1e-2,
+        amplitude: float | Tensor = 1.0,
+        forgetting: float | Tensor = 0.999,
+        follow: float | Tensor = 1.0,
         periodic: Sequence[int] = (),
-        robust: float | None = None,
+        robust: float | Tensor | None = None,
         scaling: bool = False,
     ) -> None:
         super().__init__()
@@ -196,9 +199,13 @@ class StaFRegressor(StreamEstimator):
 
     def _filters(self, streams: int, outputs: int, like: Tensor) -> FilterStreams:
         dim, dtype, toward = len(like), like.dtype, self._directions(len(like))
-        robust = math.inf if self.robust is None else positive_real(_NAME, "robust", self.robust)
         scaling, found = flag(_NAME, "scaling", self.scaling), self._tuning
-        if found is not None and found.center.shape == (streams, dim + outputs):
+        kernel, numbers = _kernel(self.kernel), {name: getattr(self, name) for name in NAMES}
+        tuned = found is not None and found.center.shape == (streams, dim + outputs)
+        if not tuned and has_rows(numbers, kernel):
+            return self._own_filters(kernel, numbers, toward, streams, outputs, like)
+        robust = math.inf if self.robust is None else positive_real(_NAME, "robust", self.robust)
+        if found is not None and tuned:
             self.centers_offsets_ = found.radius[0] * toward
             return tuned_streams(found, toward, dtype, robust, float(self.follow))
         radius = positive_real(_NAME, "radius", self.radius)
@@ -207,7 +214,7 @@ class StaFRegressor(StreamEstimator):
         if follow < 0:
             raise fail(_NAME, "follow", "must not be negative", self.follow)
         self.centers_offsets_ = offsets = radius * toward.to(like.device)
-        kernel = _kernel(self.kernel).to(like.device)
+        kernel = kernel.to(like.device)
         if kernel.core(torch.zeros_like(offsets[0]), offsets, offsets).dim() != 2:
             raise fail(_NAME, "kernel", "must have one value a hyperparameter for all streams", self.kernel)
         functions = LocalFunctions.of(kernel, offsets)
@@ -216,6 +223,24 @@ class StaFRegressor(StreamEstimator):
         base = float(self.amplitude) ** 2
         filter_ = LocalFilter(functions, ratio, forgetting, follow * radius, robust, base)
         return FilterStreams(filter_, StreamState.empty(like, streams, dim, len(offsets), outputs), scaling)
+
+    def _own_filters(
+        self,
+        kernel: Kernel,
+        numbers: dict[str, Any],
+        toward: Tensor,
+        streams: int,
+        outputs: int,
+        like: Tensor,
+    ) -> FilterStreams:
+        law = own_law(_NAME, numbers, like.dtype, streams)
+        functions = own_functions(_NAME, kernel, law["radius"], toward)
+        self.centers_offsets_ = law["radius"][:, None, None] * toward
+        ratio = (law["noise"] / law["amplitude"]).square()
+        slack, base = law["follow"] * law["radius"], law["amplitude"].square()
+        filter_ = LocalFilter(functions, ratio, law["forgetting"], slack, law["robust"], base)
+        state = StreamState.empty(like, streams, len(like), len(toward), outputs)
+        return FilterStreams(filter_, state, flag(_NAME, "scaling", self.scaling))
 
     def _law(self, dtype: torch.dtype) -> tuple[float, float]:
         """Return the checked variance of the noise in units of the process's, and the forgetting."""

@@ -52,7 +52,8 @@ def smooth_record(
     around = list(_held(torch.stack(anchors).mT).mT)  # before the first sample: where that will be
     record = means, covariances, expected, predicted, transfers, around
     mean, variance = _backwards(filter_, record, _held(x.double()))
-    return mean, variance.clamp(min=0.0).sqrt() * filter_.base**0.5
+    size = torch.as_tensor(filter_.base, dtype=torch.float64, device=mean.device).sqrt()
+    return mean, variance.clamp(min=0.0).sqrt() * size.unsqueeze(-1)
 
 
 def _held(x: Tensor) -> Tensor:

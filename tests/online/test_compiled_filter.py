@@ -13,6 +13,7 @@ import staf_torch as st
 from staf_torch.online.compiled_filter import CompiledFilter
 from staf_torch.online.kalman_filter import LocalFilter, StateParts, StreamState
 from staf_torch.online.local_functions import LocalFunctions
+from staf_torch.online.own_functions import OwnFunctions
 
 FUNCTIONS = LocalFunctions.of(st.GaussianKernel(0.8), 0.5 * st.rings(6))
 INF, NAN = math.inf, math.nan
@@ -66,8 +67,8 @@ def states(steps: int) -> dict[str, Tensor]:
 
 @pytest.mark.needs_compiler
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@pytest.mark.parametrize("robust", [INF, 2.0])
-def test_compiled_filter_is_its_definition(robust: float, dtype: torch.dtype) -> None:
+@pytest.mark.parametrize(("robust", "own"), [(INF, False), (2.0, False), (2.0, True)])
+def test_compiled_filter_is_its_definition(robust: float, own: bool, dtype: torch.dtype) -> None:
     lists = targets(float(torch.finfo(dtype).eps) ** 0.5)
     steps = max(map(len, lists.values()))
     paths = states(steps)
@@ -78,6 +79,10 @@ def test_compiled_filter_is_its_definition(robust: float, dtype: torch.dtype) ->
     ratio = torch.linspace(1e-3, 0.1, streams, dtype=torch.float64)
     forgetting = torch.linspace(0.9, 1.0, streams, dtype=torch.float64)
     definition = LocalFilter(FUNCTIONS, ratio, forgetting, 0.5, robust, 0.25)
+    if own:  # a kernel, a radius, a slack of every stream's
+        spread = torch.linspace(0.9, 1.1, streams, dtype=torch.float64)
+        functions = OwnFunctions.of(spread / 0.64, spread[:, None, None] * 0.5 * st.rings(6))
+        definition = LocalFilter(functions, ratio, forgetting, 0.5 * spread, robust * spread, 0.25 * spread)
     like = torch.zeros(0, dtype=dtype)
     fast, slow = (StreamState.empty(like, streams, 2, 6, 1) for _ in range(2))
     compiled = CompiledFilter.build(definition, fast)

@@ -205,7 +205,8 @@ class _TorchFunctions(TorchFunctionMode):
             if chosen:
                 return plain(*args, **kwargs)
         if name in _MAKES and args and isinstance(args[0], list | tuple) and tensors(args[0]):
-            return func(_stacked(args[0]), *args[1:], **kwargs)
+            given = {name: kwargs.get(name) for name in ("dtype", "device")}
+            return torch.as_tensor(_stacked(args[0]), **given)
         if name in _LEAVES_TORCH:
             if self._traced(args[0]):
                 raise NotLoweredError(f"`Tensor.{name}` takes numbers of a row out of torch", name)

@@ -7,8 +7,13 @@ struct Streams {
     REAL *table;                       // see StreamState: blocks of the rows of `lanes` streams
     int64_t *counts;                   // (4, stride)
     const double *ratio, *forgetting;  // (streams)
+#ifdef OWN  // columns, in blocks of the numbers of `lanes` streams
+    const V *offsets, *squares, *newton, *gram, *rate, *reach, *slack2, *robust, *base;
+    double tiny, most;
+#else
     Functions functions;
     double slack2, robust, base, tiny, most;
+#endif
 };
 struct Given {  // what belongs to a call alone: another thread may ask the same streams
     const Streams *of;
@@ -95,8 +100,39 @@ INLINE void read(const Call &call, int64_t first, int count, Filter &s) {
 
 INLINE Law law_of(const Call &call, int64_t first, int count) {
     const V ratio = column(call.ratio + first, 1, count), forgetting = column(call.forgetting + first, 1, count);
+#ifdef OWN
+    const int64_t at = first / lanes;
+    return {ratio, forgetting, call.slack2[at], call.robust[at], root(call.base[at]), call.tiny, call.most};
+#else
     return {ratio, forgetting, all(call.slack2), all(call.robust), std::sqrt(call.base), call.tiny, call.most};
+#endif
 }
+#ifdef OWN
+INLINE Functions functions_of(const Call &call, int64_t first) {
+    const int64_t at = first / lanes;
+    return {call.offsets + at * M * n, call.squares + at * M, call.newton + at * M * M, call.gram + at * M * M,
+            call.rate[at], call.reach[at]};
+}
+struct Gathered {  // functions of streams from anywhere in a tile
+    V offsets[M * n], squares[M], newton[M * M], gram[M * M], rate, reach;
+    Gathered(const Call &call, const int64_t *rows, int count) {
+        auto gather = [&](V *to, const V *from, int size) {
+            for (int k = 0; k < size; ++k) {
+                to[k] = V{};
+                for (int l = 0; l < lanes; ++l) {
+                    const int64_t row = rows[l < count ? l : 0];
+                    to[k][l] = from[row / lanes * size + k][row % lanes];
+                }
+            }
+        };
+        gather(offsets, call.offsets, M * n), gather(squares, call.squares, M), gather(newton, call.newton, M * M);
+        gather(gram, call.gram, M * M), gather(&rate, call.rate, 1), gather(&reach, call.reach, 1);
+    }
+    Functions functions() const { return {offsets, squares, newton, gram, rate, reach}; }
+};
+#else
+INLINE const Functions &functions_of(const Call &call, int64_t) { return call.functions; }
+#endif
 
 static void tell(const Call &call) {
     for (int64_t first = 0; first < call.streams; first += lanes) {
@@ -107,7 +143,7 @@ static void tell(const Call &call) {
         V x[n], mean[K], deviation[K];
         for (int i = 0; i < n; ++i) x[i] = column(call.x + first * n + i, n, count);
         auto get = [&](int i) { return load(learned + i * lanes); };
-        predict(call.functions, law_of(call, first, count), s, get, x, mean, deviation);
+        predict(functions_of(call, first), law_of(call, first, count), s, get, x, mean, deviation);
         if (K == 1 && count == lanes) {
             save(call.mean + first, mean[0]), save(call.deviation + first, deviation[0]);
             continue;
@@ -136,14 +172,20 @@ static void move(const Call &call, const int64_t *rows, int count, const V *h, c
         learned[i] = V{};
         for (int l = 0; l < count; ++l) learned[i][l] = at(row_learned + i, l);
     }
-    found[K + 1] = moments(call.functions, h, mean, [&](int i) { return learned[i]; }, found);
+#ifdef OWN
+    const Gathered gathered(call, rows, count);
+    const Functions functions = gathered.functions();
+#else
+    const Functions &functions = call.functions;
+#endif
+    found[K + 1] = moments(functions, h, mean, [&](int i) { return learned[i]; }, found);
     for (int l = 0; l < count; ++l) {
         const double once = call.forgetting[rows[l]], lapse = call.lapse ? call.lapse[rows[l]] : 1;
         found[K + 1][l] = 1 - (lapse == 1 ? once : std::pow(once, lapse)) * found[K + 1][l];
     }
     for (int o = 0; o < expectations; ++o)
         for (int l = 0; l < count; ++l) expected[rows[l] % tile / lanes * expectations + o][rows[l] % lanes] = found[o][l];
-    transfer(call.functions, h, mean, learned);
+    transfer(functions, h, mean, learned);
     for (int o = 0; o <= K; ++o)
         for (int i = 0; i < M; ++i)
             for (int l = 0; l < count; ++l) at(row_mean + o * M + i, l) = afresh[l] ? REAL(0) : REAL(mean[o][i][l]);
@@ -205,7 +247,7 @@ static void learn(const Call &call) {
             REAL *block = block_of(call, first), *learned = block + row_learned * lanes;
             auto put = [&](int row, V value) { save(block + row * lanes, value); };
             const Mask good = update(
-                call.functions, law_of(call, first, count), s, [&](int i) { return load(learned + i * lanes); },
+                functions_of(call, first), law_of(call, first, count), s, [&](int i) { return load(learned + i * lanes); },
                 [&](int i, V value) { save(learned + i * lanes, value); }, z, y, seen, lapse, v.fine, v.stays,
                 v.moves & ~v.afresh, expected + (first - begin) / lanes * expectations);
             for (int o = 0; o <= K; ++o)

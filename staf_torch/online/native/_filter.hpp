@@ -73,9 +73,15 @@ INLINE V exponential(V x) {
     return x < -708. ? V{} : x != x ? x : found;
 }
 
+#ifdef OWN
+typedef V Number;  // a stream's own, of own_functions.py
+#else
+typedef double Number;
+#endif
+INLINE V all(V x) { return x; }
 struct Functions {  // of local_functions.py, in float64
-    const double *offsets, *squares, *newton, *gram;  // d (M, n), |d|^2 (M), C (M, M) upper triangular, K0 (M, M)
-    double rate, reach;                               // q; the largest |d|
+    const Number *offsets, *squares, *newton, *gram;  // d (M, n), |d|^2 (M), C (M, M) upper triangular, K0 (M, M)
+    Number rate, reach;                               // q; the largest |d|
 };
 
 struct Filter {  // of lanes streams
@@ -85,7 +91,7 @@ struct Filter {  // of lanes streams
 
 struct Law {
     V ratio, forgetting, slack2, robust;
-    double size;  // standard deviation of the process in the units of y, at first
+    Number size;  // standard deviation of the process in the units of y, at first
     double tiny, most;  // the square root of the precision of the streams, their largest number
 };
 
