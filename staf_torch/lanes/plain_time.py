@@ -20,6 +20,8 @@ _OPERATION, _ENTRY = 5e-6, 2.5e-9  # s
 _TRANSFORMED = 3  # operations more that one takes for each transform of torch.func around it
 GAIN = 2.0
 """Builds that a loop must take in plain torch before it is compiled."""
+DIFFERENTIATED = 100
+"""Times that a loop counts of which a gradient is wanted: four passes each, and who asks asks again."""
 _OFTEN = 256  # operations after which it is asked
 _BUILD, _BUILT_OPERATION = 1.5, 5e-5  # s
 

@@ -12,8 +12,10 @@ from torch import Tensor
 
 from ..lanes import Program, repeat, shared_program
 from ..lanes.compiled_methods import undecided, worth
+from ..lanes.gradients import wants_gradient
 from ..lanes.loop_program import LoopProgram
 from ..lanes.opaque import opaque
+from ..lanes.plain_time import DIFFERENTIATED
 from ..lanes.row_numbers import over_rows, over_some_rows, some_rows
 from ..lanes.trace.step import Step
 from ..lanes.tree import Tree
@@ -65,7 +67,9 @@ def trajectory(
     size = total if chunk is None else integer("trajectory", "chunk", chunk, least=1)
     flow = getattr(system, "flow", None)  # a user's module need not have one
 
-    program, none, x = _stepped(system, dt, 1, total, len(x0)), torch.full_like(x0[..., 0], torch.nan), x0
+    often = DIFFERENTIATED if wants_gradient(system, x0) else 1
+    program, x = _stepped(system, dt, 1, often * total, len(x0)), x0
+    none = torch.full_like(x0[..., 0], torch.nan)
     for start in range(0, total, size):
         stop = min(start + size, total)
         time = torch.arange(start, stop, dtype=torch.float64, device="cpu") * dt

@@ -18,6 +18,7 @@ from ...lanes.compiled_methods import undecided, worth
 from ...lanes.gradients import wants_gradient
 from ...lanes.loop_program import LoopProgram
 from ...lanes.opaque import opaque
+from ...lanes.plain_time import DIFFERENTIATED
 from ...lanes.row_numbers import each_row, over_rows, some_rows
 from ...lanes.tree import flatten, unflatten
 from ...numerics.angles import wrap
@@ -328,7 +329,8 @@ class _LoopRun:
         """The result of a loop and its last state."""
         parts = list(loop.controller.modules())
         work = self.steps * (loop.holding.steps + max(getattr(part, "work", 1.0) for part in parts) - 1)
-        pays = work * (1 + len(self.x0) / 200) >= _PAYS
+        often = DIFFERENTIATED if wants_gradient(loop, self.x0) else 1
+        pays = often * work * (1 + len(self.x0) / 200) >= _PAYS
         pays = pays and not any(getattr(part, "costly", False) for part in parts)
         compiled = (worth(pays) if self.compile == "auto" else bool(self.compile)) and loop.system.traceable
         found = program(loop, compiled)
