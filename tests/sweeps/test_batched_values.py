@@ -103,7 +103,6 @@ BATCHES = {
     "directions": (["centers=directions"], ["centers.directions=[[1,0],[0,1]],[[0.6,0.8],[-1,0]]"]),
     "single precision": (["dtype=float32", "target=quadratic"], ["target.matrix=1.0,2.0"]),
 }
-READ_SPECTRA = {"fixed step", "heavy ball", "nesterov"}  # of K, or factor it: weights to 1e-9
 
 
 @pytest.mark.parametrize("name", BATCHES)
@@ -113,13 +112,14 @@ def test_a_member_gets_what_it_gets_alone(name: str) -> None:
     (group,) = groups(cfgs)
     assert group == list(range(len(cfgs)))
     together = GradientChase().solve(cfgs, SHOWN)  # raises where `batching.solve` would run each alone
-    iterated = name not in {"exact", "tangent"} | READ_SPECTRA
     digits = 1e-9 if name != "single precision" else 1e-3
     for cfg, found in first_and_last(cfgs, together):
         (alone,) = solutions([cfg])
         assert isinstance(found, ChaseSolution), found
-        for key in ("state", "value", *(["weights"] if iterated else [])):
+        for key in ("state", "value"):
             assert np.array_equal(found.history[key], alone.history[key]), key
+        weights, size = found.history["weights"], np.abs(alone.history["weights"]).max()
+        np.testing.assert_allclose(weights, alone.history["weights"], rtol=digits, atol=digits * size)
         missing = [{key for key, number in one.metrics.items() if number is None} for one in (found, alone)]
         assert missing[0] == missing[1]
         numbers = [{k: v for k, v in one.metrics.items() if v is not None} for one in (found, alone)]
