@@ -228,7 +228,7 @@ class Gap(systems.ControlAffineSystem):
 
 def test_report_finds_the_region_of_a_plant_in_small_units() -> None:
     policy = adp.near_optimal(
-        Gap(), adp.QuadraticCost(25.0, 1.0, dim=1, inputs=1), dt=0.05, horizon=0.2, reach="local"
+        Gap(), adp.QuadraticCost(25.0, 1.0, dim=1, inputs=1), dt=0.05, horizon=0.2, reach="local", substeps=1
     )
     report = policy.report(states=2, full=True)
     assert report["regulated"] == 0  # in the box of 1

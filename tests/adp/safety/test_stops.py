@@ -27,7 +27,7 @@ def pushing(x: Tensor) -> Tensor:
     return 5 * (5 - x[..., :1]) - 2 * x[..., 1:]
 
 
-@pytest.mark.parametrize("decay", [None, 2.0, 10.0, 50.0])
+@pytest.mark.parametrize("decay", [None, 2.0, 50.0])
 def test_what_the_brakes_can_stop_stops_before_the_wall_and_the_rest_is_named(decay: float | None) -> None:
     """Field 8: h = 1 - x1, |u| <= 20; v^2 <= 40 h can stop."""
     x0 = tensor([[0.9, 1.0], [0.0, 3.0], [0.5, 2.0], [-1.0, 4.5], [-19.0, 26.0], [0.0, 6.3], [0.9, 2.5]])
