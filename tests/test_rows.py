@@ -188,11 +188,73 @@ def test_centers_and_a_basis_called_directly_take_rows(count: int) -> None:
         torch.testing.assert_close(many.offsets(x)[row], one.offsets(x[row]), rtol=1e-15, atol=0)
 
 
+MASSES, BOUNDS = (0.5, 2.0), (1.0, 2.0)
+
+
+def problems(rows: int, dtype: torch.dtype = torch.float64) -> tuple[Any, list[Any]]:
+    """A plant and a bounded cost with numbers of rows, and those of every row alone."""
+    masses, bounds = spread(*MASSES, rows).to(dtype), spread(*BOUNDS, rows).to(dtype)
+
+    def made(mass: Any, bound: Any) -> tuple[systems.Plant, adp.Cost]:
+        return systems.Pendulum(mass=mass), adp.QuadraticCost(1.0, 1.0, 2, 1, low=-bound, high=bound)
+
+    return made(st.rows(masses), st.rows(bounds)), [made(*each) for each in zip(masses, bounds, strict=True)]
+
+
+def starts(rows: int) -> Tensor:
+    return torch.randn(rows, 2, generator=torch.Generator().manual_seed(1)).double()
+
+
+@pytest.mark.parametrize("rows", [1, 2, 7])
+@pytest.mark.parametrize("period", [None, 0.05])
+def test_riccati_equations_of_rows_are_those_of_single_ones_to_the_bit(rows: int, period: Any) -> None:
+    many, alone = problems(rows)
+    found = adp.LQR(*many, period=period)
+    for row, each in enumerate(alone):
+        one = adp.LQR(*each, period=period)
+        for got, want in ((found.p, one.p), (found.k, one.k)):
+            assert torch.equal(got.full[row] if rows > 1 else got, want)
+
+
+def test_a_riccati_equation_without_a_solution_is_named_by_its_row() -> None:
+    gain = torch.tensor([1.0, 0.0, 1.0, 0.0]).double()
+
+    class Pushed(Spring):
+        def effectiveness(self, x: Tensor) -> Tensor:
+            return super().effectiveness(x) * self.get_buffer("gain")
+
+    plant = Pushed(torch.tensor(-1.0))
+    plant.register_buffer("gain", st.rows(gain))
+    for period in (None, 0.1):
+        with pytest.raises(ValueError, match=r"no input reaches its mode .* \(in row 1\)"):
+            adp.LQR(plant, adp.QuadraticCost(1.0, 1.0, 2, 1), period=period)
+
+
+@pytest.mark.parametrize("rows", [1, 2, 7])
+def test_plans_of_rows_are_those_of_single_problems_to_the_bit(rows: int, either: str) -> None:
+    if either == "never" and rows == 7:
+        return
+    many, alone = problems(rows)
+    x0 = starts(rows)
+    search = adp.BoxDDP(adp.SampledProblem.of(*many, dt=0.1), steps=5, compile=either == "always")
+    found = search.solve(x0)
+    for row, each in enumerate(alone):
+        one = adp.BoxDDP(adp.SampledProblem.of(*each, dt=0.1), steps=5, compile=either == "always")
+        for got, want in zip(found, one.solve(x0[row : row + 1]), strict=True):
+            assert torch.equal(got[row], want[0])
+    x0[-1] = torch.nan
+    beside = search.solve(x0).control
+    torch.testing.assert_close(beside[:-1], found.control[:-1], rtol=0, atol=0)
+    torch.testing.assert_close(search.solve(found.state[:, 0].float()).control, found.control.float())
+    if rows > 1:
+        with pytest.raises(ValueError, match=rf"a batch of {rows + 1} rows met numbers of .* for {rows}"):
+            search.solve(starts(rows + 1))
+
+
 def test_what_does_not_serve_rows_yet_says_so() -> None:
     plant, cost = systems.Pendulum(mass=st.rows(spread(1.0, 2.0))), adp.QuadraticCost(1.0, 1.0, 2, 1)
     for make in (
         lambda: adp.near_optimal(plant, cost, dt=0.1),
-        lambda: adp.BoxDDP(adp.SampledProblem.of(plant, cost, dt=0.1), steps=3),
         lambda: adp.DirectShooting(plant, cost, horizon=1.0),
         lambda: adp.RolloutPolicy.of_lqr(plant, cost),
     ):

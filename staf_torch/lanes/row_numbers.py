@@ -142,8 +142,10 @@ class RowNumbers(Tensor):
         resolve: Resolve | None = getattr(_active, "resolve", None)
         if resolve is None or (resolve is _refuse and _asks_structure(func)):
             return _operation(func, args, kwargs)
-        args, kwargs = tree_map(lambda x: resolve(x) if isinstance(x, RowNumbers) else x, (args, kwargs))
-        return func(*args, **kwargs)
+        if kwargs or any(isinstance(x, list | tuple) for x in args):
+            args, kwargs = tree_map(lambda x: resolve(x) if isinstance(x, RowNumbers) else x, (args, kwargs))
+            return func(*args, **kwargs)
+        return func(*[resolve(x) if isinstance(x, RowNumbers) else x for x in args])
 
     @classmethod
     def __torch_dispatch__(  # type: ignore[override]
@@ -184,6 +186,12 @@ def nonzero(number: Any) -> bool:
 def all_rows(tensor: Tensor) -> Tensor:
     """Return the memory of a tensor: (B, ...) of numbers of rows, itself of others."""
     return tensor.full if isinstance(tensor, RowNumbers) else tensor
+
+
+def value_of(tensor: Tensor) -> Tensor:
+    """Return the number of the row whose turn it is: for transforms of `torch.func`, which do not look."""
+    resolve: Resolve | None = getattr(_active, "resolve", None)
+    return tensor if resolve is None or not isinstance(tensor, RowNumbers) else resolve(tensor)
 
 
 @contextmanager
@@ -264,36 +272,41 @@ def over_rows(function: Callable[..., Some], *given: Tree) -> Some:
     return found
 
 
-def each_row(function: Callable[[], Some], most: int | None = None, *, named: bool = False) -> list[Some]:
-    """function() of every row, which sees its own numbers alone; once where it reads no numbers of rows.
-
-    For what decides by values, as a design does.
+def tried(function: Callable[[], Some]) -> tuple[Some | None, int | None]:
+    """Return function(), and how many rows the numbers have that it read: with None it read none of rows.
 
     Args:
-        function: of no arguments.
-        most: rows, spread over all of them; all by default.
-        named: whether an error says of which row it is.
+        function: of no arguments; it is left where it reads a number of rows.
     """
     if not in_use():
-        return [function()]
+        return function(), None
     try:
         with resolving(_refuse):
-            return [function()]
+            return function(), None
     except RowsMetError as error:
         count = len(columns([error.numbers], None)[0])
     for met in getattr(_active, "met", ()):
         met.append(count)
+    return None, count
+
+
+def each_row(function: Callable[[], Some], most: int | None = None) -> list[Some]:
+    """function() of every row, which sees its own numbers alone; once where it reads no numbers of rows.
+
+    Args:
+        function: of no arguments.
+        most: rows, spread over all of them; all by default.
+    """
+    found, count = tried(function)
+    if count is None:
+        return [found]  # type: ignore[list-item]
+    return [in_row(row, count, function) for row in spread_rows(count, most).tolist()]
+
+
+def spread_rows(count: int, most: int | None = None) -> Tensor:
+    """Return rows (R,), so many at most, spread over all of them."""
     few = count if most is None else min(count, most)
-    rows = torch.linspace(0, count - 1, few, dtype=torch.float64, device="cpu").round().long().tolist()
-    found = []
-    for row in rows:
-        try:
-            found.append(_in_row(row, count, function))
-        except ValueError as error:
-            if not named:
-                raise
-            raise ValueError(f"{error} (in row {row})") from error
-    return found
+    return torch.linspace(0, count - 1, few, dtype=torch.float64, device="cpu").round().long()
 
 
 def beside(function: Callable[[], Some]) -> Some | None:
@@ -323,10 +336,39 @@ def met_rows() -> Iterator[list[int]]:
         _active.met = before
 
 
-def _in_row(row: int, count: int, function: Callable[[], Some]) -> Some:
+def in_row(row: int, count: int, function: Callable[[], Some]) -> Some:
     """function() with the numbers of one row of so many."""
-    with resolving(lambda numbers: columns([numbers], count)[0][row]):
+    column = column_of(count)
+    with turn_of(row), resolving(lambda numbers: column(numbers)[row]):
         return function()
+
+
+@contextmanager
+def turn_of(row: int) -> Iterator[None]:
+    """Within the block a function runs for this row, or for several of which it is the first."""
+    before, _active.row = getattr(_active, "row", 0), row
+    try:
+        yield
+    finally:
+        _active.row = before
+
+
+def first_row() -> bool:
+    """Return whether it is the turn of the first row, or of none: one warning in the log is enough."""
+    return getattr(_active, "row", 0) == 0
+
+
+def column_of(count: int) -> Callable[[RowNumbers], Tensor]:
+    """Return what gives the numbers (B, ...) of so many rows, whatever rows are chosen later."""
+    chosen = getattr(_active, "chosen", None)
+
+    def column(numbers: RowNumbers) -> Tensor:
+        found = numbers.full if chosen is None else numbers.full[chosen]
+        if len(found) != count:
+            raise _other_count(found, count)
+        return found
+
+    return column
 
 
 def over_some_rows(function: Callable[..., Some], chosen: Tensor, *given: Tree) -> Some:
@@ -382,7 +424,14 @@ def _decides(error: RuntimeError) -> bool:
 
 def _operation(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
     """One operation of numbers of rows outside of a batch: numbers of rows, too."""
-    name, leaves, spec = getattr(func, "__name__", ""), *tree_flatten((args, kwargs))
+    name = getattr(func, "__name__", "")
+    if (
+        args
+        and isinstance(args[0], RowNumbers)
+        and (name in _STRUCTURE or (name == "__get__" and func.__self__.__name__ in _ATTRIBUTES))
+    ):
+        return func(args[0].full.detach()[0], *args[1:], **kwargs)
+    leaves, spec = tree_flatten((args, kwargs))
     at = [k for k, leaf in enumerate(leaves) if isinstance(leaf, RowNumbers)]
     full = [leaves[k].full for k in at]
     if name in ("__get__", "__set__"):
@@ -391,12 +440,8 @@ def _operation(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
             return RowNumbers(full[0].data) if name == "__get__" else setattr(args[0], "full", full[-1])
         if attribute in _OF_ALL or name == "__set__":
             return func(full[0], *args[1:])
-        if attribute in _ATTRIBUTES:
-            return func(full[0].detach()[0])
     if name == "_has_compatible_shallow_copy_type":  # a module makes a new parameter then
         return False
-    if name in _STRUCTURE:
-        return func(full[0].detach()[0], *args[1:], **kwargs)
     if name in _READS:
         raise _no_single_value(f"Tensor.{name}")
     if name == "requires_grad_":

@@ -1,9 +1,9 @@
-"""Objects whose numbers differ from row to row: made row by row, and merged into one.
+"""Objects whose numbers differ from row to row: made of all rows at once, and merged into one.
 
-A constructor decides by values (it solves a Riccati equation, refuses what is not positive), which numbers of
-many rows at once do not allow. It runs once for every row, with that row's numbers alone. The objects that
-come out are of one structure, and where they differ they differ in numbers: tensors and floats become
-`RowNumbers`, everywhere else they must be equal.
+A constructor decides by values (it refuses what is not positive, counts modes). It runs for all rows that
+decide alike together (`row_decisions`), or for every row alone. The objects that come out are of one
+structure, and where they differ they differ in numbers: tensors and floats become `RowNumbers`, everywhere
+else they must be equal.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ import torch
 from torch import Tensor, nn
 
 from .contents import BOUND, Contents, Derived
-from .row_numbers import RowNumbers, beside, each_row, in_use, met_rows, over_rows
+from .row_decisions import at_once, is_of_rows
+from .row_numbers import RowNumbers, all_rows, beside, in_use, over_rows, spread_rows, tried
 from .tree import Shared, plain
 
 Some = TypeVar("Some")
@@ -90,7 +91,7 @@ def refuse_rows(call: str, **given: Any) -> None:
 
 
 def by_rows(function: Callable[Given, Some]) -> Callable[Given, Some]:
-    """Decorator of a function that decides by values: with numbers of rows it runs for every row by itself.
+    """Decorator of a function that decides by values: with numbers of rows it runs for all that decide alike.
 
     Its results are merged: tensors and floats that differ become `RowNumbers`.
     """
@@ -104,16 +105,21 @@ def by_rows(function: Callable[Given, Some]) -> Callable[Given, Some]:
 
 def made_by_rows(make: Callable[[], Some]) -> Some:
     """Return what ``make`` returns; where it reads numbers of rows, that of all rows, merged."""
-    if not in_use():
-        return make()
-    with met_rows() as met:
-        found = each_row(make, named=True)
-    if not met:
-        return found[0]
-    made = merged(found)
+    found, count = tried(make)
+    if count is None:
+        return found  # type: ignore[return-value]
+    parts = at_once(make, count, spread_rows(count))
+    if len(parts) == 1:
+        return parts[0].found  # type: ignore[no-any-return]
+    objects, rows = [part.found for part in parts], [part.rows for part in parts]
+    made = merged(objects, rows)
     if any(isinstance(tensor, RowNumbers) for tensor in Contents(made).tensors):
         return made
-    return merged(found, beside(make))  # as many rows as there are, although all are alike
+    return merged(objects, rows, beside(make))  # as many rows as there are, although all are alike
+
+
+class Note(str):
+    """A text on what an object lacks: of rows, which all lack it or none, that of the first."""
 
 
 class Rowwise(abc.ABCMeta):
@@ -211,7 +217,7 @@ def _holds_rows(value: Any) -> bool:
 
 
 def _alone(value: Any) -> Any:
-    """Return the number of the row whose turn it is: a float, or a tensor of more."""
+    """Return the number of the row whose turn it is: a float, or a tensor of more, or of many rows."""
     if isinstance(value, list | tuple) and _holds_rows(value):
         parts = map(_alone, value)
         return type(value)(*parts) if hasattr(value, "_fields") else type(value)(parts)
@@ -220,34 +226,42 @@ def _alone(value: Any) -> Any:
     if not isinstance(value, RowNumbers):
         return value
     tensor = value + 0.0
-    return tensor.item() if tensor.dim() == 0 else tensor
+    return tensor.item() if tensor.dim() == 0 and not is_of_rows(tensor) else tensor
 
 
 def _with_rows(value: Any, size: int) -> Any:
     return Shared(value) if isinstance(value, Tensor) and value.dim() <= size else value
 
 
-def merged(objects: Sequence[Some], other: Some | None = None) -> Some:
+def merged(objects: Sequence[Some], rows: Sequence[Tensor] | None = None, other: Some | None = None) -> Some:
     """Return the object that has the numbers of all rows.
 
     Args:
-        objects: one a row, of one class and structure.
+        objects: of one class and structure, one a row.
+        rows: of each object, (R,), where an object has the numbers of several; all of them are all rows.
         other: one with other numbers; equal numbers in which it differs are of rows, too.
 
     Raises:
         ValueError: if they differ in more than numbers.
     """
+    if rows is None:
+        rows = [torch.tensor([row], dtype=torch.int64, device="cpu") for row in range(len(objects))]
+    pairs = sorted(zip(rows, objects, strict=True), key=lambda pair: int(pair[0][0]))
+    rows, values = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
     if other is not None:
         with contextlib.suppress(ValueError):  # it may differ in more
-            found: Some = _Merge(rows=len(objects)).of([*objects, other], type(objects[0]).__name__)
+            found: Some = _Merge(rows).of([*values, other], type(other).__name__)
             return found
-    made: Some = _Merge().of(list(objects), type(objects[0]).__name__)
+    made: Some = _Merge(rows).of(values, type(values[0]).__name__)
     return made
 
 
 class _Merge:
-    def __init__(self, rows: int | None = None) -> None:
-        self._rows = rows  # that are kept, all by default
+    """Merges objects, each with the numbers of these rows; one more may say which numbers are of rows."""
+
+    def __init__(self, rows: Sequence[Tensor]) -> None:
+        self._rows = rows
+        self._count = sum(map(len, rows))
         self._made: dict[tuple[int, ...], Any] = {}
         self._kept: list[Any] = []  # addresses are used once
 
@@ -256,14 +270,14 @@ class _Merge:
         if all(value is first for value in values):
             return first
         kind = type(first)
-        if isinstance(first, Tensor):
+        if any(isinstance(value, Tensor) for value in values):
             return self._tensor(values, name)
         if any(type(value) is not kind for value in values):
             raise self._differ(values, name)
         if kind is float:
             if all(value == first or (value != value and first != first) for value in values):
                 return first
-            return RowNumbers(torch.tensor(values[: self._rows], dtype=torch.float64, device="cpu"))
+            return self._tensor(values, name)
         key = tuple(map(id, values))
         if key not in self._made:
             self._kept.append(values)
@@ -271,20 +285,24 @@ class _Merge:
         return self._made[key]
 
     def _tensor(self, values: list[Any], name: str) -> Any:
-        if any(isinstance(value, RowNumbers) for value in values):  # of which each has its own row
-            pairs = enumerate(values)
-            values = [v.full[k % len(v.full)] if isinstance(v, RowNumbers) else v for k, v in pairs]
+        one = next((v for v in values if isinstance(v, Tensor)), None)
+        real, device = (torch.float64, "cpu") if one is None else (one.dtype, str(one.device))
+        values = [torch.tensor(v, dtype=real, device=device) if isinstance(v, float) else v for v in values]
         first = values[0]
         alike = all(
             isinstance(v, Tensor) and v.shape == first.shape and v.dtype == first.dtype for v in values
         )
         if not alike:
             raise self._differ([tuple(v.shape) if isinstance(v, Tensor) else v for v in values], name)
-        if all(torch.equal(v, first) for v in values):
+        if not any(isinstance(v, RowNumbers) for v in values) and all(torch.equal(v, first) for v in values):
             return first
         if not first.is_floating_point():
             raise self._differ(values, name)
-        made = RowNumbers(torch.stack([value.detach() for value in values[: self._rows]]))
+        full = all_rows(first).detach().new_empty(self._count, *first.shape)
+        for value, rows in zip(values, self._rows, strict=False):
+            part = all_rows(value).detach()  # of all rows where it was not made for these
+            full[rows] = part[rows] if isinstance(value, RowNumbers) and len(part) != len(rows) else part
+        made = RowNumbers(full)
         return nn.Parameter(made, first.requires_grad) if isinstance(first, nn.Parameter) else made
 
     def _new(self, values: list[Any], kind: type, name: str, key: tuple[int, ...]) -> Any:
@@ -318,7 +336,7 @@ class _Merge:
                     each[key] = torch.zeros_like(there) if each[key] is None else each[key]
             vars(made).update(self._dict(held, name))
             return made
-        if all(value == first for value in values):
+        if all(value == first for value in values) or (isinstance(first, Note) and all(values)):
             return first
         raise self._differ(values, name)
 
@@ -354,9 +372,10 @@ class _Merge:
 
     def _differ(self, values: list[Any], name: str) -> ValueError:
         other = next(k for k, value in enumerate(values) if not _equal(value, values[0]))
+        row, first = (int(self._rows[k][0]) if k < len(self._rows) else None for k in (other, 0))
         return ValueError(
-            f"rows differ in `{name}`, which is no number: {values[0]!r} in row 0 and {values[other]!r} in "
-            f"row {other}; what is no number must be the same in all rows."
+            f"rows differ in `{name}`, which is no number: {values[0]!r} in row {first} and "
+            f"{values[other]!r} in row {row}; what is no number must be the same in all rows."
         )
 
 

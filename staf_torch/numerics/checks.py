@@ -167,11 +167,16 @@ def numbers_of(call: str, name: str, value: Any) -> Any:
     return value.tolist()
 
 
-def one_or_each(call: str, name: str, value: object, count: int) -> Tensor:
+def one_or_each(call: str, name: str, value: Any, count: int) -> Tensor:
     """Return a finite number for each of ``count``, given as one for all or one each: (count,) float64."""
-    given = numbers_of(call, name, number(call, name, value) if isinstance(value, Tensor) else value)
-    if not isinstance(given, Sequence):
-        given = [real(call, name, given)] * count
+    if isinstance(value, Tensor):
+        refuse_gradient(call, **{name: value})
+        given = number(call, name, value)
+        assert isinstance(given, Tensor)
+        if given.dim() > 1 or (given.dim() and len(given) != count):
+            raise fail(call, name, f"must be one number or a list of {count}", value)
+        return given.detach().to("cpu", torch.float64).expand(count).clone()
+    given = value if isinstance(value, Sequence) else [real(call, name, value)] * count
     numbers = vector(call, name, given)
     if len(numbers) != count:
         raise fail(call, name, f"must be one number or a list of {count}", value)

@@ -16,8 +16,10 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from ..lanes import scan
+from ..lanes.row_decisions import in_any_row
 from .default_device import designed_on_cpu
 from .linalg import exponential
 
@@ -53,18 +55,18 @@ def quadratic_integral(matrix: Tensor, rate: Tensor, length: float) -> tuple[Ten
 
     Source: Van Loan, "Computing integrals involving the matrix exponential", IEEE TAC 23 (1978).
     """
-    size = len(matrix)
-    doublings = max(
-        0, 2 + math.ceil(math.log2(max(float(torch.linalg.matrix_norm(matrix, 1)) * length, 1e-9)))
-    )
-    h = length / 2**doublings
+    size = (torch.linalg.matrix_norm(matrix, 1) * length).clamp(min=1e-9)
+    doublings = (2 + size.log2().ceil()).clamp(min=0)  # of a row of `torch.func.vmap` its own
+    h, n = length * torch.exp2(-doublings), len(matrix)
     rows = torch.cat((-matrix.mT, rate), dim=1), torch.cat((torch.zeros_like(matrix), matrix), dim=1)
     step = exponential(h * torch.cat(rows))
-    flow = step[size:, size:]
-    paid = flow.mT @ step[:size, size:]
-    for _ in range(doublings):
-        paid = paid + flow.mT @ paid @ flow
-        flow = flow @ flow
+    flow = step[n:, n:]
+    paid = flow.mT @ step[:n, n:]
+    done = 0
+    while in_any_row(doublings > done):
+        paid = torch.where(doublings > done, paid + flow.mT @ paid @ flow, paid)
+        flow = torch.where(doublings > done, flow @ flow, flow)
+        done += 1
     return flow, 0.5 * (paid + paid.mT)
 
 
@@ -91,12 +93,7 @@ def exponential_step(
     paid = None
     if curvature is not None:
         # (moved, N, N', N'', d at the start): moved' = A moved + N.
-        whole = torch.zeros(5 * n, 5 * n, dtype=torch.float64, device="cpu")
-        whole[:n, :n] = a
-        for k in range(3):
-            whole[k * n : (k + 1) * n, (k + 1) * n : (k + 2) * n] = torch.eye(
-                n, dtype=torch.float64, device="cpu"
-            )
+        whole = pad(_chain(a), (0, n, 0, n))
         both = torch.zeros(n, 5 * n, dtype=torch.float64, device="cpu")
         both[:, :n] = both[:, 4 * n :] = torch.eye(n, dtype=torch.float64, device="cpu")
         rate = both.mT @ curvature.double() @ both
@@ -115,14 +112,15 @@ def exponential_step(
 def _phi(a: Tensor, h: float) -> tuple[Tensor, Tensor, Tensor]:
     """phi_1, phi_2, phi_3 of h A, (n, n) each."""
     n = len(a)
-    whole = torch.zeros(4 * n, 4 * n, dtype=torch.float64, device="cpu")
-    whole[:n, :n] = h * a
-    for k in range(3):
-        whole[k * n : (k + 1) * n, (k + 1) * n : (k + 2) * n] = torch.eye(
-            n, dtype=torch.float64, device="cpu"
-        )
-    found = exponential(whole)[:n]
+    found = exponential(_chain(h * a))[:n]
     return found[:, n : 2 * n], found[:, 2 * n : 3 * n], found[:, 3 * n :]
+
+
+def _chain(a: Tensor) -> Tensor:
+    """A, and three integrators after it: (n, n) -> (4 n, 4 n)."""
+    n = len(a)
+    after = torch.diag(torch.ones(3 * n, dtype=torch.float64, device="cpu"), n)
+    return after + pad(a, (0, 3 * n, 0, 3 * n))
 
 
 def times(matrix: Tensor, x: Tensor) -> Tensor:

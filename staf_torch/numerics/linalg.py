@@ -14,8 +14,10 @@ import torch
 from torch import Tensor
 
 from ..lanes.one_thread import alone, small_in_scipy
+from ..lanes.row_decisions import in_any_row
 from .checks import fail, positive_real, real, vector
 from .default_device import designed_on_cpu
+from .riccati_equations import continuous_solution, discrete_gain, discrete_solution
 
 Matrix = float | Sequence[float] | Sequence[Sequence[float]] | Tensor
 
@@ -38,7 +40,7 @@ def _symmetric(call: str, name: str, matrix: Tensor, size: int) -> None:
         raise fail(call, name, f"must be ({size}, {size})", matrix)
     if not bool(torch.isfinite(matrix).all()):
         raise fail(call, name, "must be finite", matrix)
-    if not torch.allclose(matrix, matrix.mT, rtol=1e-12, atol=0.0):
+    if bool(((matrix - matrix.mT).abs() > 1e-12 * matrix.abs()).any()):
         raise fail(call, name, "must be symmetric", matrix)
 
 
@@ -67,7 +69,7 @@ def positive_definite(call: str, name: str, matrix: Tensor, size: int) -> Tensor
         ValueError: if it is anything else.
     """
     _symmetric(call, name, matrix, size)
-    if float(torch.linalg.eigvalsh(matrix.detach())[0]) <= 0:
+    if bool(torch.linalg.eigvalsh(matrix.detach())[0] <= 0):
         raise fail(call, name, "must be positive definite", matrix)
     return matrix.to(torch.float64)
 
@@ -80,7 +82,7 @@ def positive_semidefinite(call: str, name: str, matrix: Tensor, size: int) -> Te
     """
     _symmetric(call, name, matrix, size)
     values = torch.linalg.eigvalsh(matrix.detach())
-    if float(values[0]) < -1e-12 * float(values.abs().max()):
+    if bool(values[0] < -1e-12 * values.abs().max()):
         raise fail(call, name, "must be positive semidefinite", matrix)
     return matrix.to(torch.float64)
 
@@ -94,17 +96,15 @@ def unstabilisable_mode(a: Tensor, b: Tensor, discrete: bool = False) -> complex
         b: (n, m).
         discrete: whether A and B are those of x+ = A x + B u.
     """
-    size = a.shape[0]
-    scale = max(1.0, float(a.abs().max()))
-    for eigenvalue in torch.linalg.eigvals(a).tolist():
-        if abs(eigenvalue) < 1 - 1e-9 if discrete else eigenvalue.real < -1e-9 * scale:
-            continue
-        pencil = torch.cat(
-            (a - eigenvalue * torch.eye(size, dtype=torch.complex128, device="cpu"), b + 0j), dim=1
-        )
-        if float(torch.linalg.svdvals(pencil)[size - 1]) < 1e-9 * scale:
-            return complex(eigenvalue)
-    return None
+    scale = a.abs().max().clamp(min=1.0)
+    modes = torch.linalg.eigvals(a)
+    stays = modes.abs() >= 1 - 1e-9 if discrete else modes.real >= -1e-9 * scale
+    if not in_any_row(stays):
+        return None
+    shifted = a - modes[:, None, None] * torch.eye(len(a), dtype=modes.dtype, device=a.device)
+    pencil = torch.cat((shifted, (b + 0j).expand(len(a), *b.shape)), dim=-1)
+    missed = stays & (torch.linalg.svdvals(pencil)[:, len(a) - 1] < 1e-9 * scale)
+    return complex(modes[missed][0].item()) if bool(missed.any()) else None
 
 
 @designed_on_cpu
@@ -173,8 +173,10 @@ def riccati(a: Tensor, b: Tensor, q: Tensor, r: Tensor, *, name: str = "the syst
     positive_semidefinite("riccati", "q", q, a.shape[0])
     positive_definite("riccati", "r", r, b.shape[1])
     check_modes(a.double(), b.double(), q.double(), name=name)
-    solution = solver("solve_continuous_are")(*(m.double().cpu().numpy() for m in (a, b, q, r)))
-    p = torch.from_numpy(solution)
+    given = [m.double().cpu() for m in (a, b, q, r)]
+    p = continuous_solution(*given)
+    if bool(torch.isnan(p).any()):
+        p = torch.from_numpy(solver("solve_continuous_are")(*(m.numpy() for m in given)))
     return 0.5 * (p + p.mT)
 
 
@@ -192,9 +194,11 @@ def discrete_riccati(a: Tensor, b: Tensor, paid: Tensor) -> tuple[Tensor, Tensor
     """
     n = len(a)
     q, s, r = paid[:n, :n], paid[:n, n:], paid[n:, n:]
-    solved = solver("solve_discrete_are")(*(t.numpy() for t in (a, b, q, r)), s=s.numpy())
-    p = 0.5 * torch.from_numpy(solved + solved.T)
-    return p, torch.linalg.solve(r + b.mT @ p @ b, b.mT @ p @ a + s.mT)
+    p = discrete_solution(a, b, q, s, r)
+    if bool(torch.isnan(p).any()):
+        p = torch.from_numpy(solver("solve_discrete_are")(*(t.numpy() for t in (a, b, q, r)), s=s.numpy()))
+    p = 0.5 * (p + p.mT)
+    return p, discrete_gain(p, a, b, s, r)
 
 
 def row_jacobian(function: Callable[[Tensor], Tensor], at: Tensor) -> tuple[Tensor, Tensor]:

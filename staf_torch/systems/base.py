@@ -8,6 +8,8 @@ from typing import ClassVar, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from ..lanes.row_decisions import in_any_row
+from ..lanes.row_numbers import value_of
 from ..lanes.row_objects import OfRows
 from ..numerics.angles import wrap
 from ..numerics.checks import trailing
@@ -228,11 +230,11 @@ class ControlAffineSystem(Plant):
 
     def linearisation(self, x: Tensor | None = None, u: Tensor | None = None) -> Linearisation:
         """A = d(f + g u)/dx and B = g at rest, by automatic differentiation."""
-        at = self.equilibrium() if x is None else x
+        at = value_of(self.equilibrium() if x is None else x)
         resting = self.resting_input() if u is None else u
         matrix = torch.func.jacrev(self.smooth_drift)(at)
         g = self.effectiveness(at).detach()
-        if bool((resting != 0).any()):
+        if in_any_row(resting != 0):
             pushed = torch.func.jacrev(self.effectiveness)(at)  # (n, m, n)
             matrix = matrix + (pushed * resting.to(at)[:, None]).sum(-2)
         return Linearisation(matrix.detach(), g)

@@ -9,8 +9,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from ..lanes.gradients import refuse_gradient
 from ..lanes.row_numbers import all_rows
-from ..numerics.checks import fail, numbers_of
+from ..numerics.checks import fail
 
 Limit = float | Sequence[float] | Tensor | None
 
@@ -87,9 +88,9 @@ def _limit(name: str, given: Limit, none: float, inputs: int) -> Tensor:
         given = none
     if isinstance(given, bool) or not isinstance(given, int | float | Sequence | Tensor):
         raise fail("Bounds", name, "must be a number or one an input", given)
-    numbers = numbers_of("Bounds", name, given)
+    refuse_gradient("Bounds", **{name: given})
     try:
-        limit = torch.as_tensor(numbers, dtype=torch.float64, device=getattr(numbers, "device", "cpu"))
+        limit = torch.as_tensor(given, dtype=torch.float64, device="cpu").detach()
     except (TypeError, ValueError) as error:
         raise fail("Bounds", name, "must be a number or one an input", given) from error
     if limit.dim() == 0:

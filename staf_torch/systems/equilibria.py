@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ..lanes.gradients import refuse_gradient
+from ..lanes.row_decisions import in_any_row
 from ..numerics.differences import central_slopes
 from ..signs import Sign
 from .base import Plant
@@ -135,11 +136,13 @@ def find_equilibrium(
 
 def _gauss_newton(motions: Callable[[Tensor], Tensor], z: Tensor) -> Tensor:
     """Solve motion = 0 by the smallest Gauss-Newton steps from z (k,): rows (B, k) -> (B, n)."""
+    going = torch.ones_like(z[:1], dtype=torch.bool)  # of a row of `torch.func.vmap` its own
     for _ in range(_STEPS):
         slopes, moves = central_slopes(motions, z), motions(z.unsqueeze(0))[0]
         step = torch.linalg.lstsq(slopes, -moves.unsqueeze(-1), driver="gelsd").solution[:, 0]
-        z = z + step
-        if not bool(torch.isfinite(z).all()) or float(step.norm()) <= 1e-14 * (1 + float(z.norm())):
+        z = torch.where(going, z + step, z)
+        going = going & torch.isfinite(z).all() & (step.norm() > 1e-14 * (1 + z.norm()))
+        if not in_any_row(going):
             break
     return z
 
@@ -147,7 +150,7 @@ def _gauss_newton(motions: Callable[[Tensor], Tensor], z: Tensor) -> Tensor:
 def _rests(plant: Plant, x: Tensor, u: Tensor) -> bool:
     moves, size = _motion(plant, x, u), len(x)
     slopes = central_slopes(lambda v: _motions(plant, v[:, :size], v[:, size:]), torch.cat((x, u)))
-    largest = max(float(slopes.abs().max()), 1e-3)  # change of the motion per unit of state or input
+    largest = slopes.abs().max().clamp(min=1e-3)  # change of the motion per unit of state or input
     return bool((moves.abs() <= _REST * largest).all())
 
 

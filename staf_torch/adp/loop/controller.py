@@ -220,7 +220,8 @@ class LQR(nn.Module, metaclass=OfRows):
             name = type(system).__name__
             rest = 0.5 * cost.discount * torch.eye(len(a), dtype=a.dtype, device=a.device)
             p = riccati(a - rest, b, still.state_curvature(), cost.r, name=name)
-            k = self.cost.r_inverse.to(p) @ b.to(p).mT @ p
+            # As of many rows, to the bit.
+            k = (self.cost.r_inverse.to(p).unsqueeze(0) @ b.to(p).mT @ p)[0]
         else:
             p, k = held_riccati(system, still, self.period)
         clock = self.cost.dim - len(p)

@@ -19,7 +19,8 @@ from ...lanes.gradients import wants_gradient
 from ...lanes.loop_program import LoopProgram
 from ...lanes.opaque import opaque
 from ...lanes.plain_time import DIFFERENTIATED
-from ...lanes.row_numbers import each_row, over_rows, some_rows
+from ...lanes.row_decisions import decided
+from ...lanes.row_numbers import over_rows, some_rows
 from ...lanes.tree import flatten, unflatten
 from ...numerics.angles import wrap
 from ...numerics.checks import choice, copied, fail, integer, positive_real, trailing
@@ -456,5 +457,5 @@ def _check(system: Plant, cost: Cost, x0: Tensor) -> Cost:
             )
     check_problem(system, cost)
     placed = cost.around(system)
-    each_row(lambda: warn_if_restless("simulate", system, placed), _ROWS)
+    decided(lambda: warn_if_restless("simulate", system, placed), _ROWS)
     return placed

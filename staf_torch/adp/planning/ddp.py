@@ -20,6 +20,8 @@ from ...lanes import Program, repeat, scan, traced_as
 from ...lanes.gradients import without_gradient
 from ...lanes.one_thread import alone
 from ...lanes.opaque import opaque
+from ...lanes.row_decisions import numbers_of_rows
+from ...lanes.row_numbers import over_rows, some_rows
 from ...lanes.tree import Tree, flatten, unflatten
 from ...numerics.box import minimum_and_slopes
 from ...numerics.checks import fail, integer, positive_real, trailing
@@ -141,9 +143,7 @@ class BoxDDP:
         if control is None and self.problem.unregulated:
             return self._best_of_several(x0, terminal)
         if control is None:
-            gains = (-self.problem.k).expand(*expected, n)
-            reference = Reference(self.problem.goals(x0, self.steps)[:, :-1], gains)
-            control = self.problem.rest.expand(expected)
+            control, reference = over_rows(self._linear, x0)
         if control.shape != expected:
             raise ValueError(
                 f"`BoxDDP.solve(control=...)` must have the shape {expected}; got {tuple(control.shape)}."
@@ -151,34 +151,44 @@ class BoxDDP:
         if reference is None:
             still = x0.unsqueeze(1).expand(-1, self.steps, -1)
             reference = Reference(still, x0.new_zeros(*expected, n))
-        ends: End = self.ends(x0) if terminal is None else terminal
+        ends: End = over_rows(self.ends, x0) if terminal is None else terminal
         together = max(1, _NUMBERS // (self.steps * (n + 1) * (n + m) ** 2))
         whole = x0, self.problem.admissible(control), *reference, *ends
         if len(x0) <= together:
             with alone(len(x0) * self.steps * (n + m) ** 2):
                 return self._solve(*whole)
-        parts = [self._solve(*some) for some in zip(*(part.split(together) for part in whole), strict=True)]
+        parts = []
+        for rows in torch.arange(len(x0), device=x0.device).split(together):
+            with some_rows(rows):
+                parts.append(self._solve(*(part[rows] for part in whole)))
         return Trajectories(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
     def _best_of_several(self, x0: Tensor, terminal: LocalModel | None) -> Trajectories:
         """The cheapest trajectories of the cheapest first controls of each row."""
-        b, tried = len(x0), self.problem.admissible(first_controls(self.problem, self.steps))
-        ends = self.ends(x0) if terminal is None else terminal
+        b = len(x0)
+        (tried,) = numbers_of_rows(lambda: (self._first_controls(),)).numbers  # (B or 1, G, T, m)
+        tried = tried.to(x0).expand(b, -1, -1, -1).transpose(0, 1)
+        ends = over_rows(self.ends, x0) if terminal is None else terminal
         still = x0.unsqueeze(1).expand(-1, self.steps, -1)
         none = x0.new_zeros(*still.shape[:2], self.problem.inputs, x0.shape[1])
         zero = x0.new_zeros(b, self.steps, self.problem.inputs), none, x0.new_ones(b, 1)
-        cost = torch.stack(
-            [
-                self._followed(x0, (still, u.expand(b, -1, -1), *zero[:2]), zero[2], ends).cost
-                for u in tried.to(x0)
-            ]
-        )
+        cost = torch.stack([self._followed(x0, (still, u, *zero[:2]), zero[2], ends).cost for u in tried])
         best = cost.argsort(dim=0, stable=True)[:_STARTS]  # (S, B)
-        count = len(best)
-        again = None if terminal is None else rows_of(terminal, torch.arange(b, device="cpu").repeat(count))
-        found = self.solve(x0.repeat(count, 1), tried.to(x0)[best].flatten(0, 1), None, again)
+        count, rows = len(best), torch.arange(b, device="cpu")
+        again = None if terminal is None else rows_of(terminal, rows.repeat(count))
+        with some_rows(rows.repeat(count)):
+            found = self.solve(x0.repeat(count, 1), tried[best, rows].flatten(0, 1), None, again)
         lowest = torch.where(torch.isfinite(found.cost), found.cost, torch.inf).view(count, b)
-        return rows_of(found, lowest.argmin(0) * b + torch.arange(b, device="cpu"))
+        return rows_of(found, lowest.argmin(0) * b + rows)
+
+    def _first_controls(self) -> Tensor:
+        return self.problem.admissible(first_controls(self.problem, self.steps))
+
+    def _linear(self, x0: Tensor) -> tuple[Tensor, Reference]:
+        """The linear feedback of the goal as a first control of (B, n), and what it is a feedback around."""
+        problem, shape = self.problem, (len(x0), self.steps, self.problem.inputs)
+        goals = problem.goals(x0, self.steps)[:, :-1]
+        return problem.rest.expand(shape), Reference(goals, (-problem.k).expand(*shape, problem.dim))
 
     def ends(self, x0: Tensor) -> End:
         """V_T of plans from x0 (B, n): the value of the goal's linear feedback, or what the problem pays."""
@@ -217,8 +227,9 @@ class BoxDDP:
         for _ in range(self.iterations):
             if not len(rows):
                 break
-            known = self._derivatives(now) if known is None else known
-            after = self._iterated(now, known, ends)
+            with some_rows(rows):
+                known = self._derivatives(now) if known is None else known
+                after = self._iterated(now, known, ends)
             for part, current in zip(found, after, strict=True):
                 part[rows] = current
             on = after.going > 0
@@ -226,7 +237,9 @@ class BoxDDP:
             known = rows_of(known, on)
             rows, now, ends = rows[on], rows_of(after, on), rows_of(ends, on)
             if bool(fresh.any()):  # saves work: rows that did not move keep their derivatives
-                for old, fresher in zip(known, self._derivatives(rows_of(now, fresh)), strict=True):
+                with some_rows(rows[fresh]):
+                    again = self._derivatives(rows_of(now, fresh))
+                for old, fresher in zip(known, again, strict=True):
                     old[fresh] = fresher
         return found
 

@@ -12,6 +12,8 @@ from torch import Tensor
 
 from ...lanes import compiled, traced_as, where_rows
 from ...lanes.gradients import without_gradient
+from ...lanes.row_decisions import numbers_of_rows
+from ...lanes.row_numbers import over_rows, some_rows
 from ...numerics.checks import fail, flag, integer, trailing
 from ..loop.controller import Controller
 from ..policies.sampled_rollout import SampledRollout
@@ -134,7 +136,7 @@ class RecedingHorizon(Controller):
 
     def idle(self, x0: Tensor) -> Following:
         """The linear feedback of the goal as a plan, not yet followed from the states x0 (B, n)."""
-        plan = resting(self.problem, self.problem.goals(x0, self.steps)[:, :-1])
+        plan = over_rows(lambda x: resting(self.problem, self.problem.goals(x, self.steps)[:, :-1]), x0)
         return Following(plan, torch.zeros_like(plan[:, 0, 0]))
 
     @without_gradient("RecedingHorizon.step", "x", "self")
@@ -159,7 +161,7 @@ class RecedingHorizon(Controller):
         assert self._search is not None
         control, reference = self._begun(x, carried)
         found = self._search.solve(x, control, reference, self._terminal(x, control, reference))
-        hold = resting(self.problem, self.problem.goals(found.state[:, -1], 0))
+        hold = over_rows(lambda x: resting(self.problem, self.problem.goals(x, 0)), found.state[:, -1])
         plan = torch.cat((_rows(found)[:, 1:], hold), dim=1)
         return found.control[:, 0], Following(plan, torch.zeros_like(carried.done))
 
@@ -215,14 +217,12 @@ def held_plans(search: BoxDDP, x: Tensor, best: int) -> list[Trajectories]:
     """The cheapest of these trajectories, the next ones, ...: so many."""
     if search.problem.unregulated:  # which has several of its own
         return [search.solve(x)]
-    control, feedback = held_controls(search.problem, search.steps)
-    count, b = len(control), len(x)
+    begun = numbers_of_rows(lambda: held_controls(search.problem, search.steps)).numbers  # (B or 1, G, ...)
+    count, b = begun[0].shape[1], len(x)
+    control, feedback = (each.expand(b, *each.shape[1:]).transpose(0, 1).flatten(0, 1) for each in begun)
     goal = search.problem.goals(x, search.steps)[:, :-1]
-    found = search.solve(
-        x.repeat(count, 1),
-        control.repeat_interleave(b, 0),
-        Reference(goal.repeat(count, 1, 1), feedback.repeat_interleave(b, 0)),
-    )
+    with some_rows(torch.arange(b, device="cpu").repeat(count)):
+        found = search.solve(x.repeat(count, 1), control, Reference(goal.repeat(count, 1, 1), feedback))
     cost = torch.where(torch.isfinite(found.cost), found.cost, torch.inf).view(count, b)
     order = cost.argsort(dim=0, stable=True)[:best]
     return [rows_of(found, first * b + torch.arange(b, device="cpu")) for first in order]

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from ...lanes.row_decisions import in_any_row
 from ...numerics.checks import fail, one_or_each, positive
 from ...numerics.linalg import Matrix
 from ...systems.bounds import Limit
@@ -75,7 +76,7 @@ class BoundedInputCost(Cost):
         self.register_buffer("_up", box.high, persistent=False)
         self._down: Tensor
         self._up: Tensor
-        self._symmetric = torch.equal(self._down, self._up)
+        self._symmetric = not in_any_row(self._down != self._up)
 
     def input_rate(self, u: Tensor) -> Tensor:
         effort = self.effort(u)

@@ -9,7 +9,8 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor, nn
 
-from ...lanes.row_numbers import nonzero
+from ...lanes.row_decisions import in_any_row
+from ...lanes.row_numbers import nonzero, value_of
 from ...lanes.row_objects import OfRows, by_rows
 from ...numerics.angles import periods_of, turned, wrap, wrap_each
 from ...numerics.box import LARGEST, box_minimum, face_inverses
@@ -17,10 +18,9 @@ from ...numerics.checks import (
     copied,
     fail,
     non_negative,
-    numbers_of,
+    one_or_each,
     real,
     trailing,
-    vector,
 )
 from ...numerics.default_device import beside, device_of
 from ...numerics.linalg import Matrix, positive_definite, positive_semidefinite, square
@@ -150,11 +150,12 @@ class Cost(nn.Module, metaclass=OfRows):
         else:
             x = self.target
             u = resting_input_at(plant, x) if self.target_input is None else self.target_input
-        u = u if bool(torch.isfinite(u).all()) else plant.resting_input()
+        if in_any_row(~torch.isfinite(u)):
+            u = torch.where(torch.isfinite(u).all(), u, plant.resting_input())
         placed = copied(self)
         # An origin that the plant does not take by itself is kept: `around` may be asked again.
-        placed.target = x if bool((x != 0).any() or (plant.equilibrium() != 0).any()) else None
-        placed.target_input = u if bool((u != 0).any()) else None
+        placed.target = x if in_any_row((x != 0).any() | (plant.equilibrium() != 0).any()) else None
+        placed.target_input = u if in_any_row(u != 0) else None
         placed.periodic = plant.periodic
         if self.output is not None and self.periodic != plant.periodic:
             placed._periods = periods_of(self.output, self.dim, plant.periodic)
@@ -250,7 +251,7 @@ class Cost(nn.Module, metaclass=OfRows):
         if self.output is None:
             return self.q
         at = self.q.new_zeros(self.dim) if self.target is None else self.target
-        slope: Tensor = torch.func.jacrev(self.output)(at).detach()
+        slope: Tensor = torch.func.jacrev(self.output)(value_of(at)).detach()
         return slope.mT @ self.q @ slope
 
     def rate(self, x: Tensor, u: Tensor) -> Tensor:
@@ -316,7 +317,7 @@ class QuadraticCost(Cost):
     """
 
     def _prepare(self) -> None:
-        self._coupled = not torch.equal(self.r, torch.diag(self.r.diagonal()))
+        self._coupled = in_any_row(self.r != torch.diag(self.r.diagonal()))
         if self.bounds is None or not self._coupled:
             return
         if self.inputs > LARGEST:
@@ -359,10 +360,11 @@ def pulled(effectiveness: Tensor, gradient: Tensor) -> Tensor:
 def _point(call: str, name: str, value: Sequence[float] | Tensor | None, size: int) -> Tensor | None:
     if value is None:
         return None
-    given = numbers_of(call, name, value)
-    if isinstance(given, Sequence) and len(given) != size:
+    if not isinstance(value, Tensor | Sequence):
+        raise fail(call, name, "must be a list of numbers", value)
+    if (value.numel() if isinstance(value, Tensor) else len(value)) != size:
         raise fail(call, name, f"must have {size} numbers", value)
-    return torch.tensor(vector(call, name, given, size), dtype=torch.float64, device="cpu")
+    return one_or_each(call, name, value, size)
 
 
 def _outputs(call: str, output: Output, x: Tensor, inputs: int) -> int:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from ...lanes.gradients import without_gradient
 from ...lanes.one_thread import small
@@ -55,8 +56,7 @@ def exact_hold(f: Tensor, g: Tensor, q: Tensor, r: Tensor, period: float, *, dis
     """
     positive_real("exact_hold", "period", period)
     n, m = g.shape
-    whole = torch.zeros(n + m, n + m, dtype=torch.float64, device="cpu")
-    whole[:n, :n], whole[:n, n:] = f, g
+    whole = pad(torch.cat((f, g), dim=1).double(), (0, 0, 0, m))
     whole = whole - 0.5 * discount * torch.eye(n + m, dtype=torch.float64, device="cpu")
     rate = torch.block_diag(q.double(), r.double())
     flow, paid = quadratic_integral(whole, rate, period)
@@ -95,12 +95,7 @@ def linear_hold(plant: Plant, cost: Cost, period: float) -> Hold:
     if plant.period is None:
         return exact_hold(f, g, q, r, period, discount=cost.discount)
     share = math.exp(-0.5 * cost.discount * plant.period)
-    z = f.new_zeros(len(f) + g.shape[1], len(f) + g.shape[1])
-    z[: len(f), : len(f)], z[: len(f), len(f) :], z[len(f) :, len(f) :] = (
-        f,
-        g,
-        torch.eye(g.shape[1], dtype=g.dtype, device=g.device),
-    )
+    z = _with_input(f, g)
     flow, paid = torch.eye(len(z), dtype=z.dtype, device=z.device), torch.zeros_like(z)
     rate = plant.period * torch.block_diag(q, r)
     for _ in range(periods("linear_hold", plant, period)):
@@ -229,7 +224,21 @@ class HeldLoop(NamedTuple):
 
     def spectral_radius(self, period: float) -> float:
         """Return the spectral radius over one period; NaN where something has no finite slope."""
-        return self._radius(*_held(self.plant, self.f, self.g, period)) if self.finite else math.nan
+        return float(self.radius(period))
+
+    def radius(self, period: float) -> Tensor:
+        """Return `spectral_radius`, ()."""
+        if not self.finite:
+            return torch.full_like(self.f[0, 0], math.nan)
+        return self._radius(*_held(self.plant, self.f, self.g, period))
+
+    def fastest(self) -> Tensor:
+        """Return the size of the fastest mode without control, 1/s, (); inf where something is not finite."""
+        return (
+            torch.linalg.eigvals(self.f).abs().max()
+            if self.finite
+            else torch.full_like(self.f[0, 0], math.inf)
+        )
 
     def largest_period(self) -> float | None:
         """Return the largest stable period, as in `HeldStability`."""
@@ -237,7 +246,7 @@ class HeldLoop(NamedTuple):
             return None
         if self.plant.period is not None:
             tried = enumerate(islice(_steps(self.f, self.g), _STEPS))
-            stable = next((k for k, held in tried if self._radius(*held) >= 1), None)
+            stable = next((k for k, held in tried if float(self._radius(*held)) >= 1), None)
             if stable is None:
                 return math.inf
             return stable * self.plant.period if stable else None
@@ -255,36 +264,44 @@ class HeldLoop(NamedTuple):
             low, high = (middle, high) if self.spectral_radius(middle) < 1 else (low, middle)
         return low
 
-    def _radius(self, a: Tensor, b: Tensor) -> float:
+    def _radius(self, a: Tensor, b: Tensor) -> Tensor:
         held = a + b @ self.slope
-        return float(torch.linalg.eigvals(held).abs().max()) if bool(held.isfinite().all()) else math.inf
+        finite = held.isfinite().all()
+        radius = torch.linalg.eigvals(torch.where(finite, held, torch.zeros_like(held))).abs().max()
+        return torch.where(finite, radius, math.inf)
 
 
 def _moved(f: Tensor, g: Tensor, *, discrete: bool) -> Tensor:
     """An orthonormal basis, (n, c), of the states that inputs reach; of all where another mode grows."""
-    size, scale = len(f), float(f.norm()) + 1.0
-    columns = [g / (float(g.norm()) + torch.finfo(g.dtype).tiny)]
+    size, scale = len(f), f.norm() + 1.0
+    columns = [g / (g.norm() + torch.finfo(g.dtype).tiny)]
     for _ in range(size - 1):
         columns.append(f @ columns[-1] / scale)
     left, sizes, _ = torch.linalg.svd(torch.cat(columns, dim=-1))
-    count = int((sizes > _REACHED * sizes.amax()).sum())
-    rest = left[:, count:]
-    if count in (0, size):
+    reached = sizes > _REACHED * sizes.amax()
+    if bool(reached.all() | ~reached.any()):
         return torch.eye(size, dtype=f.dtype, device=f.device)
+    count = int(reached.sum())
+    rest = left[:, count:]
     modes = torch.linalg.eigvals(rest.mT @ f @ rest)
     grows = modes.abs().max() > 1 + _GROWS if discrete else modes.real.max() > _GROWS * scale
     return torch.eye(size, dtype=f.dtype, device=f.device) if bool(grows) else left[:, :count]
 
 
+def _with_input(f: Tensor, g: Tensor) -> Tensor:
+    """The step (x, u) -> (F x + G u, u), (n + m, n + m)."""
+    n, m = g.shape
+    held = torch.eye(n + m, dtype=f.dtype, device=f.device)[n:]
+    return torch.cat((torch.cat((f, g), dim=1), held))
+
+
 def _held(plant: Plant, f: Tensor, g: Tensor, dt: float) -> tuple[Tensor, Tensor]:
     """A and B of the linearised plant over dt seconds with u held."""
     n, m = g.shape
-    moved, held = torch.cat((f, g), dim=1), torch.eye(n + m, dtype=f.dtype, device=f.device)[n:]
     if plant.period is None:
-        flow = exponential(dt * torch.cat((moved, 0 * held)))
+        flow = exponential(dt * pad(torch.cat((f, g), dim=1), (0, 0, 0, m)))
     else:
-        count = periods("held_stability", plant, dt)
-        flow = torch.linalg.matrix_power(torch.cat((moved, held)), count)
+        flow = torch.linalg.matrix_power(_with_input(f, g), periods("held_stability", plant, dt))
     return flow[:n, :n], flow[:n, n:]
 
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from ...lanes import repeat, scan
 from ...lanes.loops import untraced
 from ...lanes.row_numbers import each_row, met_rows, nonzero
+from ...lanes.row_objects import made_by_rows
 from ...numerics.checks import integer, positive_real
 from ...numerics.default_device import device_of
 from ...numerics.exponential_step import (
@@ -154,8 +155,7 @@ class Holding:
     def checked(self) -> Holding:
         """Return this, with a warning in the log where steps that somebody chose are too few."""
         if self.error is None and self.plant.period is None:
-            x, u = self._samples()
-            found = self.errors(x, u)
+            found = torch.cat(each_row(lambda: self.errors(*self._samples()), _ROWS))
             if len(found) and not float(found.max()) <= GRACE * TOLERANCE:
                 _log.warning(
                     "%s: with %d integration steps a period of %.4g s the next state is wrong by up to %.2g "
@@ -264,11 +264,11 @@ class Holding:
         return (after, paid, h * (rests[2] - rests[1]).abs().amax(-1)) if watch else (after, paid)
 
     def _table(self, linear: Tensor, steps: int) -> ExponentialStep:
-        return exponential_step(linear, self.dt / steps, self.curvature, self.discount)
+        return made_by_rows(lambda: exponential_step(linear, self.dt / steps, self.curvature, self.discount))
 
     def _choose_for_rows(self, exponential: bool) -> None:
-        """Choose by the rows that need most steps, where rows have numbers of their own: classical ones then,
-        as a table of exponential steps is made of one row's numbers. A row that needs more runs again."""
+        """Choose by the rows that need most steps, where rows have numbers of their own; classical ones where
+        not all of them would choose exponential ones. A row that needs more runs again."""
 
         def chosen(exponential: bool) -> Holding:
             other = copy.copy(self)
@@ -276,10 +276,17 @@ class Holding:
             return other
 
         with met_rows() as met:
-            found = each_row(lambda: chosen(exponential), 1)
-        if met:
+            found = each_row(lambda: chosen(exponential), _ROWS)
+        tables = [each.table is not None for each in found]
+        if any(tables) and not all(tables):
             found = each_row(lambda: chosen(False), _ROWS)
         vars(self).update(vars(max(found, key=lambda each: each.steps)))
+        if met and self.table is not None:
+            if self.cost is not None:
+                self.curvature = made_by_rows(self.cost.state_curvature)
+            linear = made_by_rows(self._linearisation)
+            assert linear is not None
+            self.table = self._table(linear, self.steps)
 
     def _choose(self, exponential: bool) -> None:
         """Choose the kind of the steps and their number."""

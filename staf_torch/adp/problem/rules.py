@@ -13,7 +13,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from ...lanes.row_numbers import each_row
+from ...lanes.row_decisions import numbers_of_rows
 from ...numerics.checks import fail, positive_real
 from ...systems import Bounds, Clocked, Plant
 from ...systems.equilibria import check_rest
@@ -94,15 +94,15 @@ def check_within(call: str, argument: str, bounds: Bounds | None, u: Tensor) -> 
     if bounds is None:
         return
     bounds = bounds.on(u.device)
-    low, high = bounds.low.tolist(), bounds.high.tolist()
     if not bool(bounds.contain(u)):
+        low, high = bounds.low.tolist(), bounds.high.tolist()
         rule = f"must hold the plant at the set-point with an input within the bounds, {low} and {high}"
         raise fail(call, argument, rule, u.tolist())
     if bool(((u == bounds.low) | (u == bounds.high)).any()):
         _log.warning(
             "`%s`: the input %s that holds the plant at the set-point lies on a bound, %s and %s: a feedback "
             "can push one way only.",
-            *(call, u.tolist(), low, high),
+            *(call, u.tolist(), bounds.low.tolist(), bounds.high.tolist()),
         )
 
 
@@ -145,10 +145,15 @@ def check_regulates(call: str, plant: Plant, cost: Cost) -> None:
     near = _NEAR * (1 + x.abs()) * torch.eye(len(x), dtype=x.dtype, device=x.device)
     with torch.no_grad():
         rates = still.state_rate(torch.cat((x.unsqueeze(0), x + near, x - near)))
-    at, least = float(rates[0]), float(rates.min())
-    if abs(at) > _NOTHING or not least >= at - _NOTHING:
+    at, least = rates[0], rates.min()
+    if bool((at.abs() > _NOTHING) | ~(least >= at - _NOTHING)):
         rule = "must be 0 at the set-point and not less beside it, for a regulator"
-        raise fail(call, "cost", f"{rule}: its rate is {at:.6g} there and {least:.6g} beside it", x.tolist())
+        raise fail(
+            call,
+            "cost",
+            f"{rule}: its rate is {float(at):.6g} there and {float(least):.6g} beside it",
+            x.tolist(),
+        )
 
 
 def restless(plant: Plant, cost: Cost) -> str:
@@ -215,24 +220,30 @@ def warn_if_short(call: str, argument: str, horizon: float, decay: float) -> Non
 def warn_if_unstable(policy: Callable[[Tensor], Tensor], plant: Plant, cost: Cost, dt: float) -> float:
     """Say in the log that the linearised loop of a policy held for dt is not stable, and which period is.
 
+    Where rows have numbers of their own it is some of them that are looked at.
+
     Returns:
         The fastest mode of the linearised plant without control, 1/s; inf where it is not known.
     """
 
-    def looked_at() -> tuple[HeldLoop, float, float]:
-        held = HeldLoop.of(policy, plant, at=cost.set_point())
-        fastest = float(torch.linalg.eigvals(held.f).abs().max()) if held.finite else math.inf
-        return held, held.spectral_radius(dt), fastest
+    def loop() -> HeldLoop:
+        return HeldLoop.of(policy, plant, at=cost.set_point())
+
+    def looked_at() -> tuple[Tensor, Tensor]:
+        held = loop()
+        return held.radius(dt), held.fastest()
 
     try:
-        loops = each_row(looked_at, _ROWS)
+        found = numbers_of_rows(looked_at, _ROWS)
+        radii, fast = found.numbers
+        fastest, radii = float(fast.max()), radii.nan_to_num(-1.0, math.inf)
+        radius = float(radii.max())
+        if not radius >= 1:
+            return fastest
+        held = found.of(int(radii.argmax()), loop)
     except (RuntimeError, ValueError) as error:  # a loop runs where nobody can say whether it is stable
         _log.info("whether the linearised loop is stable was not looked at: %s", error)
         return math.inf
-    fastest = max(loop[2] for loop in loops)
-    held, radius, _ = max(loops, key=lambda loop: loop[1])
-    if not radius >= 1:
-        return fastest
     most = held.largest_period()
     remedy = "at no period" if most is None else f"up to {most:.4g} s"
     made = getattr(policy, "period", None)

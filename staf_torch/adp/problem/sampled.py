@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import NamedTuple, Self
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -14,7 +14,9 @@ from torch.nn.functional import pad
 
 from ...lanes import each, traced_as
 from ...lanes.gradients import without_gradient
-from ...lanes.row_objects import refuse_rows
+from ...lanes.row_decisions import in_any_row
+from ...lanes.row_numbers import first_row
+from ...lanes.row_objects import Note, OfRows
 from ...numerics.angles import turned, unwrapped, wrap
 from ...numerics.checks import fail, integer, trailing
 from ...numerics.default_device import beside, device_of
@@ -37,7 +39,7 @@ _log = logging.getLogger(__name__)
 _RESTS = 1e-6  # of the scale of the state: how far the goal may move in a step
 
 
-class SampledProblem(nn.Module):
+class SampledProblem(nn.Module, metaclass=OfRows):
     """min sum_k l(x_k, u_k) over low <= u_k <= high, with x_{k+1} = F(x_k, u_k).
 
     Example:
@@ -78,6 +80,12 @@ class SampledProblem(nn.Module):
         ValueError: if an argument breaks its rule or ``step`` returns other shapes.
     """
 
+    rowwise: ClassVar = {
+        **dict.fromkeys(("away", "terminal", "linear_feedback", "admissible", "end_model"), (1,)),
+        **dict.fromkeys(("advance", "offset", "steered", "derivatives"), (1, 1)),
+        "goals": (1,),
+    }
+
     @without_gradient("SampledProblem", "step", "goal", "rest", "terminal")
     @beside
     def __init__(
@@ -113,14 +121,14 @@ class SampledProblem(nn.Module):
         self.periodic = tuple(sorted({index % self.dim for index in periodic}))
         self.tick = 0.0  # s of a step, where the last coordinate is the time
         moved, paid = self._check()
-        self.unregulated, p, k = "", none.new_zeros(self.dim, self.dim), none.new_zeros(inputs, self.dim)
+        self.unregulated, p, k = Note(), none.new_zeros(self.dim, self.dim), none.new_zeros(inputs, self.dim)
         self.curved = False  # whether the cost bends in every input at the goal
         try:
             at = self._linearised()
             self._check_rest(moved, paid)
             p, k = self._regulator(at)
         except ValueError as error:
-            self.unregulated = str(error)
+            self.unregulated = Note(error)
         self.register_buffer("p", p)
         self.register_buffer("k", k)
         self.p: Tensor
@@ -129,7 +137,7 @@ class SampledProblem(nn.Module):
         self.end_value = terminal if callable(terminal) else None
         self.register_buffer("end", self._end(terminal))
         self.end: Tensor
-        if self.unregulated and self.endless:
+        if self.unregulated and self.endless and first_row():
             _log.warning(
                 "`SampledProblem` has no linear regulator at the goal (%s): the end of a plan costs nothing. "
                 "Give `terminal`, V_T of x or S of d'Sd, or a horizon after which nothing counts.",
@@ -175,7 +183,6 @@ class SampledProblem(nn.Module):
         Raises:
             ValueError: if an argument breaks its rule, or as in `SampledProblem`.
         """
-        refuse_rows("SampledProblem.of", plant=plant, cost=cost)
         check_torch("SampledProblem.of", "plant", plant)
         check_problem(plant, cost)
         cost = cost.bounded(low, high).around(plant)
@@ -305,7 +312,7 @@ class SampledProblem(nn.Module):
         )
 
     @torch.no_grad()
-    def _check(self) -> tuple[float, float]:
+    def _check(self) -> tuple[Tensor, Tensor]:
         """Check the shapes, and return how far the goal moves in a step, and at what cost."""
         x, u = self.goal.expand(2, -1), self.rest.expand(2, -1)
         trailing("SampledProblem", "goal", self.goal, 1, self.dim)
@@ -319,15 +326,15 @@ class SampledProblem(nn.Module):
             self.tick = float(after[0, -1] - x[0, -1])
             if not self.tick > 0:
                 raise fail("SampledProblem", "step", "must move the time, the last coordinate", self.tick)
-            return 0.0, 0.0
-        return float(self.offset(after, x).abs().max()), float(paid[0])
+            return torch.zeros_like(paid[0]), torch.zeros_like(paid[0])
+        return self.offset(after, x).abs().max(), paid[0]
 
-    def _check_rest(self, moved: float, paid: float) -> None:
+    def _check_rest(self, moved: Tensor, paid: Tensor) -> None:
         """Refuse a goal without a regulator: one that moves, costs something, or is held out of bounds."""
-        if not moved <= _RESTS * (1 + float(self.goal.abs().max())) or not abs(paid) <= _RESTS:
+        if not bool((moved <= _RESTS * (1 + self.goal.abs().max())) & (paid.abs() <= _RESTS)):
             raise ValueError(
-                f"the goal is no state of rest at no cost: within one step it moves by {moved:.3g} and costs "
-                f"{paid:.3g}"
+                "the goal is no state of rest at no cost: within one step it moves by "
+                f"{float(moved):.3g} and costs {float(paid):.3g}"
             )
 
     @torch.no_grad()
@@ -337,7 +344,7 @@ class SampledProblem(nn.Module):
             at = self.derivatives(self.goal.unsqueeze(0), self.rest.unsqueeze(0))
         except (RuntimeError, TypeError) as error:
             raise ValueError(f"`step` cannot be differentiated there: {error}") from error
-        self.curved = bool((at.cost_second[0].diagonal()[self.dim :] > 0).all())
+        self.curved = not in_any_row(at.cost_second[0].diagonal()[self.dim :] <= 0)
         return at
 
     def _regulator(self, at: Derivatives) -> tuple[Tensor, Tensor]:
@@ -345,7 +352,7 @@ class SampledProblem(nn.Module):
         m, n = self.inputs, self.dim - (self.path is not None)
         kept = [*range(n), *range(self.dim, self.dim + m)]  # without the time
         slope, paid = at.cost_first[0][kept], 0.5 * at.cost_second[0][kept][:, kept]
-        if self.path is None and float(slope.abs().max()) > _RESTS * (1 + float(paid.abs().max())):
+        if self.path is None and bool(slope.abs().max() > _RESTS * (1 + paid.abs().max())):
             raise ValueError(f"its cost has a slope there, {slope.tolist()}: it is no least")
         check_within("SampledProblem", "rest", self.bounds, self.rest)
         a, b = at.first[0, :n, :n], at.first[0, :n, -m:]
