@@ -213,7 +213,7 @@ def test_riccati_equations_of_rows_are_those_of_single_ones_to_the_bit(rows: int
     for row, each in enumerate(alone):
         one = adp.LQR(*each, period=period)
         for got, want in ((found.p, one.p), (found.k, one.k)):
-            assert torch.equal(got.full[row] if rows > 1 else got, want)
+            assert torch.equal(got.full[row], want)
 
 
 def test_a_riccati_equation_without_a_solution_is_named_by_its_row() -> None:

@@ -59,15 +59,15 @@ def quadratic_integral(matrix: Tensor, rate: Tensor, length: float) -> tuple[Ten
     doublings = (2 + size.log2().ceil()).clamp(min=0)  # of a row of `torch.func.vmap` its own
     h, n = length * torch.exp2(-doublings), len(matrix)
     rows = torch.cat((-matrix.mT, rate), dim=1), torch.cat((torch.zeros_like(matrix), matrix), dim=1)
-    step = exponential(h * torch.cat(rows))
-    flow = step[n:, n:]
-    paid = flow.mT @ step[:n, n:]
+    step = exponential(h * torch.cat(rows)).unsqueeze(0)  # products of one and of many have the same bits
+    flow = step[:, n:, n:]
+    paid = flow.mT @ step[:, :n, n:]
     done = 0
     while in_any_row(doublings > done):
         paid = torch.where(doublings > done, paid + flow.mT @ paid @ flow, paid)
         flow = torch.where(doublings > done, flow @ flow, flow)
         done += 1
-    return flow, 0.5 * (paid + paid.mT)
+    return flow[0], 0.5 * (paid + paid.mT)[0]
 
 
 @designed_on_cpu

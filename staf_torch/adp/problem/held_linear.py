@@ -95,13 +95,13 @@ def linear_hold(plant: Plant, cost: Cost, period: float) -> Hold:
     if plant.period is None:
         return exact_hold(f, g, q, r, period, discount=cost.discount)
     share = math.exp(-0.5 * cost.discount * plant.period)
-    z = _with_input(f, g)
-    flow, paid = torch.eye(len(z), dtype=z.dtype, device=z.device), torch.zeros_like(z)
+    z = _with_input(f, g).unsqueeze(0)  # products of one and of many have the same bits
+    flow, paid = torch.eye(z.shape[-1], dtype=z.dtype, device=z.device), torch.zeros_like(z)
     rate = plant.period * torch.block_diag(q, r)
     for _ in range(periods("linear_hold", plant, period)):
         paid = paid + flow.mT @ rate @ flow
         flow = share * z @ flow
-    return Hold(flow[: len(f), : len(f)], flow[: len(f), len(f) :], paid)
+    return Hold(flow[0, : len(f), : len(f)], flow[0, : len(f), len(f) :], paid[0])
 
 
 def held_riccati(plant: Plant, cost: Cost, period: float) -> tuple[Tensor, Tensor]:
