@@ -73,6 +73,7 @@ class Ran(NamedTuple):
         versions: of what the step reads and has no gradient.
         kept: whether the forward pass keeps the carries.
         rows: that are taken at once where it does.
+        keeps: leaves of the carry of which it does.
         budget: bytes.
     """
 
@@ -85,6 +86,7 @@ class Ran(NamedTuple):
     versions: tuple[tuple[Tensor, int], ...]
     kept: bool
     rows: int
+    keeps: frozenset[int]
     budget: int
 
 
@@ -107,7 +109,7 @@ class GradientCall:
         self._shared = [isinstance(leaf, Shared) for leaf in (*given.row, *given.now, *given.carry)]
         self._plans: dict[Any, tuple[Compiled, Plan]] = {}
         self._refused = False
-        self.deciding = program.deciding
+        self.deciding, self.needed = program.deciding, program.needed
 
     def __call__(self, leaves: Sequence[Any]) -> tuple[Any, Any] | None:
         """Return the carry and the outputs, None where the definition must compute them.
@@ -145,6 +147,7 @@ class GradientCall:
             versions=tuple((tensor, tensor._version) for tensor in fixed),
             kept=pays and self.every == 1 and size * self.rows * self.times <= _budget,
             rows=self.rows if work is None else rows_at_once(written),
+            keeps=frozenset(self.needed or range(self.sizes[2])),
             budget=_budget,
         )
 
@@ -217,7 +220,10 @@ class GradientCall:
         made = compiled.outputs[: end - self.sizes[2]]
         results += [empty_rows(like, self.rows, (self.times,), shape) for shape, _ in made]
         shapes = [(-(-self.rows // rows), self.times, *shape, rows) for shape, _ in compiled.carry]
-        kept = [fresh(like, *shape) for shape in shapes]
+        kept = [
+            fresh(like, *shape) if k in ran.keeps else fresh(like, 1, 1, *shape[2:]).expand(shape)
+            for k, shape in enumerate(shapes)
+        ]
         for k, start in enumerate(range(0, self.rows, rows)):
             block = slice(start, min(start + rows, self.rows))
             rooms = [room[block] for room in results] + [

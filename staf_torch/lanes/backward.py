@@ -76,6 +76,11 @@ class Backward:
         self._on_processor = given.ordinary() is True
         program = call.program.follower(("adjoint", self._form), self._step, follows=ran.built.followed)
         self.built = program.built(given)
+        # Leaves of the carry that the adjoint reads: what comes at a time begins with them.
+        times = () if self.built is None else self.built.trace.times
+        self._needed = {k for k in times if k < len(self._carry)}
+        call.needed.update(self._needed)
+        self._held: dict[tuple[int, int], list[Tensor]] = {}
         used = [] if self.built is None else self.built.compiled.rows
         places = {id(numbers): k for k, numbers in enumerate(ran.numbers)}
         self._read = [self._own[places[id(numbers)]] for numbers in used]
@@ -110,6 +115,8 @@ class Backward:
         Args:
             kept: the carry before every time, if the forward pass has kept it.
         """
+        if not self._needed.issubset(self._ran.keeps):
+            kept = []
         call, (rows, times) = self._call, self._blocks(bool(kept))
         slopes, sums = list[list[Tensor]](), list[list[Tensor]]()
         at_times = _AtTimes(
@@ -198,7 +205,20 @@ class Backward:
         count, length = rows.stop - rows.start, times.stop - times.start
         given = Given([*begin], now, row, self._call.structures, count, length)
         own = [column[rows] for column in self._own]
-        return self._call.run(self._ran.built, given, own, every)[-len(begin) :]
+        rooms = self._scratch(count, length) if self._on_processor and every == 1 else []
+        return self._call.run(self._ran.built, given, own, every, rooms=rooms)[-len(begin) :]
+
+    def _scratch(self, rows: int, times: int) -> list[Tensor]:
+        """Memory for what is computed again, the same for all blocks: one time of what nobody reads."""
+        if (rows, times) not in self._held:
+            compiled, carries = self._ran.built.compiled, len(self._carry)
+            like, made = torch.empty(0, dtype=compiled.real, device="cpu"), len(compiled.outputs) - carries
+            found = [empty_rows(like, rows, (), shape) for shape, _ in compiled.carry]
+            for k, (shape, _) in enumerate(compiled.outputs):
+                length = times if k - made in self._needed else 1
+                found.append(empty_rows(like, rows, (length,), shape).expand(rows, times, *shape))
+            self._held = {(rows, times): found}
+        return self._held[rows, times]
 
     def _kept(self, kept: Sequence[Tensor], rows: slice) -> list[Tensor]:
         """The carry before every time of some rows, of those that are kept, (blocks, T, ..., rows)."""

@@ -80,6 +80,7 @@ class Program(Derived):
         self._builds = False  # whether that is built first, if it was not
         self._followers: dict[Hashable, Program] = {}  # of steps that are made from this one
         self.deciding: dict[Hashable, tuple[bool, ...]] = {}  # leaves of the carry, by what has a gradient
+        self.needed = set[int]()  # leaves of the carry that an adjoint reads, once there was one
         self._tensors: Sequence[Tensor] = ()  # that the step reads, as far as is known
         self._described: tuple[bytes, Sequence[Tensor]] | None = None
         self._read: Contents | None = None  # what the step reads, once it is compiled
@@ -382,7 +383,8 @@ class Program(Derived):
             self._prepared = {}
             if read.renewed() and self._renew():
                 return
-            self._compiled, self._followers, self._tensors, self.deciding = {}, {}, (), {}
+            self._compiled, self._followers, self._tensors = {}, {}, ()
+            self.deciding, self.needed = {}, set()
             self._read = self._model = self._refused = None
             self._asked = 0
 
