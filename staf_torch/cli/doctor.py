@@ -17,8 +17,10 @@ from ..approximation.basis import StaFBasis
 from ..centers import StateFollowingCenters, rings
 from ..engine import chase
 from ..kernels import ExponentialKernel
+from ..lanes import Program
 from ..lanes.cache import cache
 from ..lanes.compiler import find_compiler
+from ..lanes.device.cuda import kernel_compiler
 from ..optim import SteepestDescent
 from ..results.build import installed
 from ..systems import Oscillator, simulate
@@ -53,10 +55,23 @@ def _findings() -> Iterator[tuple[str, str, bool]]:
     cores = os.cpu_count()
     set_by = os.environ.get("OMP_NUM_THREADS", "not set")
     yield "threads", f"{torch.get_num_threads()} of torch, {cores} cores, OMP_NUM_THREADS {set_by}", True
-    yield "gpu", torch.cuda.get_device_name(0) if torch.cuda.is_available() else "none", True
+    yield "gpu", *_gpu()
     for name, place in (("cache", cache()), ("runs", Path("runs")), ("scratch", Path(tempfile.gettempdir()))):
         yield name, *_place(place)
     yield "self-test", *_self_test()
+
+
+def _gpu() -> tuple[str, bool]:
+    """Return the card, what compiles kernels for it, and whether one has run: a row of a program."""
+    if not torch.cuda.is_available():
+        return "none", True
+    name, carry = torch.cuda.get_device_name(), torch.ones(2, dtype=torch.float64, device="cuda")
+    program = Program(lambda x, now, row: (x + 0.5 * x.sin(), ()), name="the self-test of a card")
+    found, wanted = program(carry, steps=3)[0].cpu(), program.definition(carry.cpu(), steps=3)[0]
+    if not program.compiles(carry, steps=3):
+        return f"{name}, no kernel has run: the log above says what is missing", False
+    good = torch.allclose(found, wanted, rtol=1e-12, atol=0)
+    return f"{name}, kernels by {kernel_compiler()}, one has run{'' if good else ' and is wrong'}", good
 
 
 def _place(folder: Path) -> tuple[str, bool]:

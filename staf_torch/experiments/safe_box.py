@@ -137,7 +137,7 @@ def _anywhere(cfg: DictConfig, box: Barrier) -> Tensor:
     """States drawn uniformly from the box, from [-1, 1] around its middle where a wall is missing: (B, n)."""
     count = integer(COMMAND_LINE, "safe_box.states", cfg.safe_box.states, least=1)
     share = torch.rand(count, len(box.low), dtype=torch.float64, generator=generator_of(cfg), device="cpu")
-    return (box.floor + (box.ceiling - box.floor) * share).clamp(box.low + 1e-9, box.high - 1e-9)
+    return (box.floor + (box.ceiling - box.floor) * share.to(box.low)).clamp(box.low + 1e-9, box.high - 1e-9)
 
 
 def _beside_walls(cfg: DictConfig, box: Barrier) -> Tensor:

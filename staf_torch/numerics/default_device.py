@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import functools
 from collections.abc import Callable, Iterator
 from typing import ParamSpec, TypeVar
@@ -62,6 +63,15 @@ def designed_on_cpu(function: Callable[Given, Found]) -> Callable[Given, Found]:
         return found
 
     return designed
+
+
+def on_cpu(given: Found) -> Found:
+    """Return a module or a tensor on the CPU: itself, or a copy of what is on a device."""
+    if isinstance(given, Tensor):
+        return given.cpu()
+    if isinstance(given, nn.Module) and not all(each.is_cpu for each in _tensors((given,))):
+        return copy.deepcopy(given).cpu()
+    return given
 
 
 def _tensors(given: tuple[object, ...]) -> Iterator[Tensor]:

@@ -308,7 +308,7 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
     def _drop(self, streams: Any) -> None:
         gone = self._numbers("drop", streams)
         every = torch.arange(self._streams_.count, device="cpu")
-        rows = every[~torch.isin(every, gone)]
+        rows = every[~torch.isin(every, gone.cpu())].to(gone.device)
         if self.n_streams_ is None or not len(rows):
             raise fail(self._call("drop"), "streams", "must leave a stream", streams)
         with self._device_:

@@ -86,16 +86,16 @@ class ExperienceMemory(nn.Module):
         self.states = hold(self, "states", like.new_zeros(*batch_shape, capacity, basis.dim))
         self.coefficients = hold(self, "coefficients", like.new_zeros(*batch_shape, capacity, basis.count))
         self.stored = hold(
-            self, "stored", torch.zeros(*batch_shape, capacity, dtype=torch.bool, device="cpu")
+            self, "stored", torch.zeros(*batch_shape, capacity, dtype=torch.bool, device=like.device)
         )
         self.latest = hold(
-            self, "latest", torch.full(batch_shape, -1, dtype=torch.int64, device="cpu")
+            self, "latest", torch.full(batch_shape, -1, dtype=torch.int64, device=like.device)
         )  # written last
         self.origin = hold(
             self, "origin", like.new_zeros(*batch_shape, basis.dim)
         )  # where it was first stored
         self.averaged = hold(
-            self, "averaged", torch.zeros(*batch_shape, capacity, dtype=torch.int64, device="cpu")
+            self, "averaged", torch.zeros(*batch_shape, capacity, dtype=torch.int64, device=like.device)
         )
         self.scatter = hold(self, "scatter", like.new_zeros(*batch_shape, capacity))  # usual distance
 

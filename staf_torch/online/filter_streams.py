@@ -49,17 +49,17 @@ class FilterStreams:
         self._known = torch.full_like(self.units, torch.nan) if units is None else units.double()
         self.first = like.new_zeros(size, LEARNED_AT[-1] if scaling else 0, wide + 1)  # samples and lapses
         # Of first samples; behind them, of far ones in a row. Then the place of the oldest of the latest.
-        self.clock, self.turn = (torch.zeros(size, dtype=torch.int64, device="cpu") for _ in range(2))
+        self.clock, self.turn = (torch.zeros(size, dtype=torch.int64, device=like.device) for _ in range(2))
         grows = self.units.new_full((size, state.dim), float(units is None))
         self._may_grow = grows if may_grow is None else may_grow.double()
-        self._begin(torch.arange(size, device="cpu"))
+        self._begin(torch.arange(size, device=like.device))
         self._hold(definition, state)
 
     def _begin(self, rows: Tensor) -> None:
         """Streams with these numbers know no units but those that they were given."""
         wide, known = self.units.shape[1] // 2, self._known[rows]
         given = known.isfinite().all(1)
-        unit = torch.arange(2 * wide, device="cpu") >= wide
+        unit = torch.arange(2 * wide, device=self.units.device) >= wide
         self.units[rows] = torch.where(given[:, None], known, unit.double())
         self.clock[rows] = torch.where(given, LEARNED_AT[-1], 0)
         self.first[rows] = 0.0
@@ -153,7 +153,7 @@ class FilterStreams:
         usable = seen[:, :n].any(1) & seen[:, n:].any(1) & ~both.isinf().any(1)
         young = self.clock < kept
         place = torch.where(young, self.clock, self.turn)
-        every = torch.arange(len(place), device="cpu")
+        every = torch.arange(len(place), device=place.device)
         lapses = torch.ones_like(both[:, 0]) if lapse is None else lapse
         waited = torch.where(young, self.first[every, place, -1], 0.0)  # since the last usable one
         self.first[every, place, -1] = waited + lapses
@@ -192,7 +192,9 @@ class FilterStreams:
             return
         rows = rows[some]
         self.units[rows, wide : wide + n] = torch.where(grown, moves, unit)[some]
-        order = (self.turn[rows, None] + torch.arange(LEARNED_AT[-1], device="cpu")) % LEARNED_AT[-1]
+        order = (self.turn[rows, None] + torch.arange(LEARNED_AT[-1], device=self.turn.device)) % LEARNED_AT[
+            -1
+        ]
         self._relearn(rows, self.first[rows[:, None], order])
 
     def _leave(self, x: Tensor, both: Tensor) -> None:
@@ -281,7 +283,7 @@ class FilterStreams:
         self.first = torch.cat((self.first, self.first.new_zeros(streams, *self.first.shape[1:])))
         self.clock, self.turn = (torch.cat((a, a.new_zeros(streams))) for a in (self.clock, self.turn))
         self._may_grow, self._stretch = (_joined(a, streams) for a in (self._may_grow, self._stretch))
-        self._begin(torch.arange(self.count, self.count + streams, device="cpu"))
+        self._begin(torch.arange(self.count, self.count + streams, device=self.clock.device))
         law = (_joined(a, streams) for a in (self.definition.ratio, self.definition.forgetting))
         self._hold(self.definition.with_law(*law), state)
 

@@ -27,7 +27,7 @@ def smooth_record(
     Returns:
         Mean (T, S, K) and standard deviation (T, S, 1) of V, without noise, in the units of y.
     """
-    eye = torch.eye(state.count, dtype=torch.float64, device="cpu")
+    eye = torch.eye(state.count, dtype=torch.float64, device=x.device)
     means, covariances, expected, predicted, transfers, anchors = [], [], [], [], [], []
     for k in range(len(x)):
         before, old = state.counts.clone(), state.parts(state.table.double().clone())

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ..kernels import GaussianKernel
+from ..numerics.default_device import designed_on_cpu
 from .filter_streams import FilterStreams, units_of
 from .kalman_filter import LocalFilter, StreamState
 from .local_functions import LocalFunctions
@@ -61,6 +62,7 @@ class _Candidates(NamedTuple):
     forgetting: Tensor  # (S, C)
 
 
+@designed_on_cpu
 def tuning(x: Tensor, y: Tensor, directions: Tensor) -> Tuning:
     """Widths a coordinate, noise, forgetting and radius a stream by the one-step predictive likelihood.
 
@@ -139,7 +141,7 @@ def tuned_streams(
     law = found.ratio.clone(), found.forgetting.clone()
     filter_ = LocalFilter(functions, *law, follow * float(found.radius[0]), robust)
     state = StreamState.empty(
-        torch.zeros(0, dtype=dtype, device="cpu"), len(found.ratio), n, len(directions), outputs
+        torch.zeros(0, dtype=dtype, device=directions.device), len(found.ratio), n, len(directions), outputs
     )
     stretch = torch.cat((found.width, found.width.new_ones(len(found.width), outputs)), 1)
     units = torch.cat((found.center, found.spread), 1)

@@ -95,18 +95,21 @@ class Cost(nn.Module, metaclass=OfRows):
         super().__init__()
         name = type(self).__name__
         self.dim, self.inputs, self.output = dim, inputs, output
-        self.target = _point(name, "target", target, dim)
-        tried = torch.zeros(dim, dtype=torch.float64, device="cpu") if self.target is None else self.target
+        device = device_of(state, control, target, terminal)
+        point = _point(name, "target", target, dim)
+        self.target = None if point is None else point.to(device)
+        tried = torch.zeros(dim, dtype=torch.float64, device=device) if self.target is None else self.target
         seen = dim if output is None else _outputs(name, output, tried, inputs)
         q = positive_semidefinite(name, "state", square(name, "state", state, seen), seen)
-        self.register_buffer("q", q)
+        self.register_buffer("q", q.to(device))
         r = positive_definite(name, "control", square(name, "control", control, inputs), inputs)
-        self.register_buffer("r", r)
-        self.register_buffer("r_inverse", torch.linalg.inv(r))
+        self.register_buffer("r", r.to(device))
+        self.register_buffer("r_inverse", torch.linalg.inv(r.to(device)))
         self.q: Tensor
         self.r: Tensor
         self.r_inverse: Tensor
-        self.target_input = _point(name, "target_input", target_input, inputs)
+        point = _point(name, "target_input", target_input, inputs)
+        self.target_input = None if point is None else point.to(device)
         non_negative(name, "discount", discount)
         self.discount = real(name, "discount", discount)
         if terminal is not None and (self.discount or (output is not None and not callable(terminal))):
@@ -120,7 +123,7 @@ class Cost(nn.Module, metaclass=OfRows):
         self.end: Tensor | None  # S
         self.periodic: tuple[int, ...] = ()
         self._periods: tuple[float, ...] = ()  # of the outputs
-        bounds = Bounds(low, high, inputs)
+        bounds = Bounds(low, high, inputs).on(device)
         self.bounds: Bounds | None = bounds if bounds.present else None
         self._prepare()
 

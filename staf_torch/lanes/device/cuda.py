@@ -237,6 +237,12 @@ def _nvrtc() -> Nvrtc | None:
     return None
 
 
+def kernel_compiler() -> str:
+    """Return what compiles kernels here, in a few words."""
+    found = _nvrtc()
+    return f"none: {REMEDY}" if found is None else f"NVRTC {found.version}"
+
+
 def _libraries() -> Iterator[str]:
     """Yield where NVRTC may be: what `cuda.bindings` finds, what torch brings, what the system has."""
     try:

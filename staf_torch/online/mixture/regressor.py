@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import logging
 import math
 import struct
 from collections.abc import Callable
@@ -173,6 +174,10 @@ class Bank:
 
         Nothing of the streams changes. The answers are kept: who learns at this x need not ask again.
         """
+        if not x.is_cpu:
+            _say_moved()
+            mean, deviation = self.predict(x.cpu(), shape)
+            return mean.to(x.device), deviation.to(x.device)
         shape = (len(self.table), self.shape.outputs) if shape is None else shape
         mean, deviation, answers = x.new_empty(shape), x.new_empty(shape), torch.empty_like(self.answers)
         if self._run is None:
@@ -187,6 +192,9 @@ class Bank:
 
     def learn(self, x: Tensor, y: Tensor, lapse: Tensor | None = None) -> None:
         """Learn one sample a stream: (S, n), (S, K), contiguous float64; time since the last sample, (S,)."""
+        if not x.is_cpu:
+            _say_moved()
+            x, y, lapse = x.cpu(), y.cpu(), None if lapse is None else lapse.cpu()
         if self._run is None:
             lapses = [1.0] * len(x) if lapse is None else lapse.tolist()
             streams = self.definition.each(self.table, self.answers)
@@ -196,6 +204,14 @@ class Bank:
         time = 0 if lapse is None else lapse.data_ptr()
         places = x.data_ptr(), y.data_ptr(), time, 0, 0, self.answers.data_ptr()
         self._run(_packed(self._reference, 2, *places))
+
+
+_log = logging.getLogger(__name__)
+
+
+@functools.cache
+def _say_moved() -> None:
+    _log.warning("MixtureRegressor learns on the CPU: samples on a device are moved there, answers back")
 
 
 @functools.cache

@@ -13,7 +13,7 @@ from ....lanes.gradients import without_gradient
 from ....lanes.opaque import opaque
 from ....lanes.row_objects import refuse_rows
 from ....numerics.checks import fail, integer, positive_real, trailing
-from ....numerics.default_device import beside
+from ....numerics.default_device import beside, on_cpu
 from ....numerics.linalg import Matrix, positive_semidefinite, square
 from ....signs import Sign
 from ....systems import ControlAffineSystem, Linear, Plant
@@ -134,6 +134,12 @@ class DirectShooting:
         starts: int = 6,
         seed: int = 0,
     ) -> None:
+        system, cost, terminal = (
+            on_cpu(system),
+            on_cpu(cost),
+            on_cpu(terminal),
+        )  # a search that branches on values
+        base = on_cpu(base) if base is None or callable(base) else [on_cpu(each) for each in base]
         check_torch("DirectShooting", "system", system, continuous=True)
         check_still("DirectShooting", "system", system, "`BoxDDP`")
         cost = cost.bounded(low, high).around(system)
@@ -239,10 +245,13 @@ class DirectShooting:
             ValueError: if x0 is no batch of states of the plant.
         """
         trailing("DirectShooting.solve", "x0", x0, dims=2, last=self.stage.system.dim, meta=False, vmap=False)
+        if not x0.is_cpu:
+            there = None if warm is None else _placed(warm, torch.device("cpu"))
+            return _placed(self.solve(x0.cpu(), warm=there), x0.device)
         parts = list[Optimum]()
         with Sign("", len(x0), "states") as sign:
             for k, rows in enumerate(x0.split(ROWS)):
-                at = k * ROWS + torch.arange(len(rows), device="cpu")
+                at = k * ROWS + torch.arange(len(rows), device=x0.device)
                 parts.append(self._solve(rows, None if warm is None else selected(warm, at)))
                 sign.advance(len(rows))
         return parts[0] if len(parts) == 1 else joined(parts)
@@ -446,3 +455,7 @@ def _rates(system: Plant, lqr: LQR) -> tuple[float, float]:
     a, b = system.linearisation(lqr.cost.target, lqr.cost.target_input)
     modes = torch.linalg.eigvals(a.to(lqr.p) - b.to(lqr.p) @ lqr.k)
     return float(-modes.real.max()), float(modes.abs().max())
+
+
+def _placed(found: Optimum, device: torch.device) -> Optimum:
+    return Optimum(*(each.to(device) if isinstance(each, Tensor) else each for each in found))

@@ -1,0 +1,114 @@
+"""What a run touches is where its tensors are: a device that is pretended refuses a tensor of the CPU."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from helpers_experiments import run, words
+from pretend_device import DEVICE, Elsewhere
+from torch import Tensor
+from variants import ACTOR_CRITIC_LAWS, KERNELS, LAWS, PLANTS, PREDICTORS, VALUE_BASES, by_turns, over
+
+import staf_torch as st
+from staf_torch import adp, lanes, online, systems, targets
+
+X0 = torch.tensor([[0.3, -0.2], [-0.1, 0.4]], dtype=torch.float64)
+
+
+def there(tensor: Tensor) -> Tensor:
+    return tensor.to(DEVICE)
+
+
+def agree(found: Tensor, wanted: Tensor) -> None:
+    assert isinstance(found, Elsewhere)
+    torch.testing.assert_close(found.cpu(), wanted, rtol=1e-9, atol=1e-12)
+
+
+def test_a_device_that_is_pretended_refuses_tensors_of_the_cpu() -> None:
+    with pytest.raises(RuntimeError, match="same device"):
+        there(X0) + X0
+
+
+def controllers(plant: Any, cost: Any) -> dict[str, Any]:
+    points = adp.RandomPoints(1, st.StateRadius(2.1, 1e-5)), adp.QuadraturePoints(2, 2, 0.5)
+    lqr = adp.LQR(plant, cost)
+    found = {"lqr": lqr, "held": adp.LQR(plant, cost, period=0.01), "function": lambda x: -3 * x[..., 1:]}
+    found["supervised"] = adp.Supervised(adp.Feedback(lambda x: 9 * x[..., 1:]), lqr, cost)
+    found["rollout"] = adp.RolloutPolicy.of_lqr(plant, cost, steps=2, horizon=0.1)
+    for k, (name, law) in enumerate(ACTOR_CRITIC_LAWS.items()):
+        basis = list(VALUE_BASES.values())[k % len(VALUE_BASES)]()
+        found[name] = adp.ActorCritic(basis, plant, cost, points[k % 2], law())
+    return found
+
+
+@pytest.mark.parametrize("made_there", [False, True])
+def test_a_closed_loop_is_where_its_states_are(made_there: bool) -> None:
+    def problem() -> tuple[Any, Any]:
+        return systems.TwoState(), adp.QuadraticCost(1.0, 1.0, 2, 1, low=-5.0, high=5.0)
+
+    plain, (plant, cost) = controllers(*problem()), problem()
+    if made_there:
+        plant, cost = plant.to(DEVICE), cost.to(DEVICE)
+    for name, controller in controllers(plant, cost).items():
+        with lanes.compiling("never"):
+            wanted = adp.simulate(plain[name], *problem(), X0, dt=0.01, steps=2)
+            found = adp.simulate(controller, plant, cost, there(X0), dt=0.01, steps=2)
+        agree(found.state, wanted.state)
+        agree(found.cost, wanted.cost)
+
+
+@over(PLANTS)
+def test_a_plant_and_its_trajectories_follow_the_states(name: str) -> None:
+    plant = PLANTS[name]()
+    assert plant.dim is not None
+    x0 = 0.1 * torch.ones(2, plant.dim, dtype=torch.float64)
+    wanted = systems.simulate(plant, x0, dt=0.01, steps=2)
+    moved = PLANTS[name]().to(DEVICE)
+    agree(systems.simulate(moved, there(x0), dt=0.01, steps=2), wanted)
+    agree(moved.linearisation().matrix, plant.linearisation().matrix)
+
+
+@pytest.mark.parametrize(("kernel", "law"), by_turns(KERNELS, list(LAWS)))
+def test_a_chase_follows_the_states(kernel: str, law: str) -> None:
+    states = systems.simulate(systems.Oscillator(), X0, dt=0.05, steps=3)
+    predictor = PREDICTORS["secant"] if law == "steepest descent" else None
+
+    def chased(x: Tensor) -> Tensor:
+        centers = st.StateFollowingCenters(st.rings(6), st.StateRadius(0.4, 0.01))
+        basis = st.StaFBasis(KERNELS[kernel].make(), centers).to(x.device)
+        return st.chase(x, basis, targets.Paper(), LAWS[law], predictor=predictor).estimate
+
+    agree(chased(there(states)), chased(states))
+
+
+@pytest.mark.parametrize("kind", [st.StaFRegressor, online.MixtureRegressor])
+def test_streams_take_samples_of_a_device(kind: Any) -> None:
+    x = torch.stack((torch.arange(12.0).cos(), torch.arange(12.0).sin()), -1).double()
+    one, other = (kind().fit(place(x), place(x).sum(-1)) for place in (Tensor.clone, there))
+    agree(other.predict(there(x[3])), one.predict(x[3]))
+
+
+def test_a_design_of_a_device_is_that_of_the_cpu() -> None:
+    plant, cost = systems.Pendulum(), adp.QuadraticCost(1.0, 1.0, 2, 1, low=-3.0, high=3.0)
+    wanted = adp.DirectShooting(plant, cost, horizon=0.5, intervals=4, starts=1).solve(X0[:1])
+    plant, cost = plant.to(DEVICE), cost.to(DEVICE)
+    agree(
+        adp.DirectShooting(plant, cost, horizon=0.5, intervals=4, starts=1).solve(there(X0[:1])).value,
+        wanted.value,
+    )
+
+
+@pytest.mark.parametrize("name", ["gradient_chase", "faults", "icl"])
+def test_an_experiment_runs_on_a_device_with_the_numbers_of_the_cpu(name: str, tmp_path: Path) -> None:
+    folders = [tmp_path / "here", tmp_path / "there"]
+    for folder in folders:
+        folder.mkdir()
+    wanted = run(folders[0], *words(name), "figures=false", "history=false").metrics
+    found = run(folders[1], *words(name), "figures=false", f"device={DEVICE.type}").metrics
+    assert found == {
+        key: None if number is None else pytest.approx(number, rel=1e-6, abs=1e-9)
+        for key, number in wanted.items()
+    }
