@@ -36,7 +36,8 @@ class Alike(NamedTuple):
     """What a function returned for some of the rows, which decided alike."""
 
     rows: Tensor  # (R,) int64
-    found: Any  # with numbers (R, ...) as `RowNumbers` where they differ; those of the row where R is 1
+    found: Any  # with numbers (R, ...) as `RowNumbers`, or those of one row alone
+    together: bool = True
 
 
 class _SplitError(BaseException):

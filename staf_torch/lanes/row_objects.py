@@ -109,7 +109,7 @@ def made_by_rows(make: Callable[[], Some]) -> Some:
     if count is None:
         return found  # type: ignore[return-value]
     parts = at_once(make, count, spread_rows(count))
-    if len(parts) == 1:
+    if len(parts) == 1 and parts[0].together:
         return parts[0].found  # type: ignore[no-any-return]
     objects, rows = [part.found for part in parts], [part.rows for part in parts]
     made = merged(objects, rows)
