@@ -323,6 +323,8 @@ def test_a_regressor_reads_no_address_of_a_tensor_without_numbers() -> None:
         ):
             with pytest.raises(ValueError, match=message):
                 fitted.predict(given)
+        with pytest.raises(ValueError, match=r"predict\(x=...\)` must hold all samples at once"):
+            torch.func.vmap(fitted.predict)(X)
         torch.set_default_device("meta")
         try:
             assert math.isclose(fitted.predict(X[0].numpy()), float(right), rel_tol=1e-12)

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..lanes.call import at_once
 from ..lanes.gradients import refuse_gradient
 from ..numerics.checks import fail
 
@@ -17,6 +18,11 @@ def tensor_of(call: str, name: str, value: Any) -> Tensor:
     if isinstance(value, Tensor):
         if value.requires_grad:
             refuse_gradient(call, **{name: value})
+        if torch._C._functorch.is_functorch_wrapped_tensor(value):
+            rule = "must hold all samples at once: transforms of `torch.func` have no part in it"
+            raise ValueError(
+                f"`{call}({name}=...)` {rule}; flatten the dimension of `vmap` into the samples."
+            )
         if value.is_nested or value.layout is not torch.strided or value.is_complex():
             form = "nested" if value.is_nested else f"{value.layout}, {value.dtype}"
             raise ValueError(
@@ -50,10 +56,8 @@ def in_place(value: Any, dtype: torch.dtype | None, shape: tuple[int, ...]) -> b
         type(value) is Tensor
         and value.dtype is dtype
         and value.shape == shape
-        and value.is_cpu
-        and not value.requires_grad
         and value.is_contiguous()
-        and not value.is_neg()
+        and at_once(value)
     )
 
 

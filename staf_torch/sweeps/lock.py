@@ -39,7 +39,7 @@ class DirectoryLock:
     """
 
     def __init__(self, directory: Path, kind: str = "sweep") -> None:
-        self._path, self.kind = directory / NAME, kind
+        self._path, self.kind, self.thread = directory / NAME, kind, threading.get_ident()
         self._directory = directory.absolute()
         self._file = self._taken()
         self._inode = os.stat(self._directory)
@@ -124,37 +124,42 @@ class DirectoryLock:
 
 _held: dict[str, DirectoryLock] = {}
 """The locks of this process, by the absolute paths of the directories."""
+_holding = threading.Lock()
 
 
 def hold(directory: Path, kind: str = "sweep") -> DirectoryLock:
     """Take the lock of a directory for this process; arguments and errors as of `DirectoryLock`."""
     key = os.path.abspath(directory)
-    if key in _held:
-        raise TakenError(f"{directory} belongs to a {_held[key].kind} that goes on in this process.")
-    _held[key] = DirectoryLock(directory, kind)
-    return _held[key]
+    with _holding:
+        if key in _held:
+            raise TakenError(f"{directory} belongs to a {_held[key].kind} that goes on in this process.")
+        found = _held[key] = DirectoryLock(directory, kind)
+    return found
 
 
 def held(directory: Path) -> DirectoryLock | None:
-    """Return the lock of a directory where this process has it."""
-    return _held.get(os.path.abspath(directory))
+    """Return the lock of a directory where this thread has it."""
+    found = _held.get(os.path.abspath(directory))
+    return found if found is not None and found.thread == threading.get_ident() else None
 
 
 def give_back(directory: Path) -> None:
-    """Release the lock of a directory where this process has it."""
-    lock = _held.pop(os.path.abspath(directory), None)
+    """Release the lock of a directory where this thread took it: one that was refused frees nobody else's."""
+    lock = held(directory)
     if lock is not None:
+        del _held[os.path.abspath(directory)]
         lock.release()
 
 
 @contextlib.contextmanager
 def returned() -> Iterator[None]:
-    """Context: a directory that was locked inside of it is given back in the end, and removed if empty."""
-    before = set(_held)
+    """Context: a directory that this thread locks in it is given back in the end, and removed if empty."""
+    before, thread = set(_held), threading.get_ident()
     try:
         yield
     finally:
-        for directory in set(_held) - before:
+        mine = {directory for directory, lock in list(_held.items()) if lock.thread == thread}
+        for directory in mine - before:
             give_back(Path(directory))
             with contextlib.suppress(OSError):  # something is in it
                 os.rmdir(directory)

@@ -8,6 +8,7 @@ import os
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +16,7 @@ from pathlib import Path
 import pytest
 from command_line import environment
 
-from staf_torch.sweeps.lock import NAME, DirectoryLock, TakenError, give_back, held, hold
+from staf_torch.sweeps.lock import NAME, DirectoryLock, TakenError, give_back, held, hold, returned
 
 
 @pytest.fixture(autouse=True)
@@ -60,6 +61,23 @@ def test_a_second_owner_is_told_of_the_first_in_this_process_or_another(tmp_path
     assert held(tmp_path) is None
     assert not (tmp_path / NAME).exists()
     hold(tmp_path)
+
+
+def test_a_thread_that_is_refused_frees_nobody_elses_directory(tmp_path: Path) -> None:
+    first, met = hold(tmp_path), []
+
+    def second() -> None:
+        with pytest.raises(TakenError), returned():
+            hold(tmp_path)
+        give_back(tmp_path)
+        met.append(held(tmp_path))
+
+    thread = threading.Thread(target=second)
+    thread.start()
+    thread.join()
+    assert met == [None]
+    assert held(tmp_path) is first
+    assert (tmp_path / NAME).exists()
 
 
 def test_a_directory_is_the_same_by_any_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
