@@ -80,9 +80,8 @@ def at_once(function: Callable[[], Some], count: int, rows: Tensor) -> list[Alik
             _log.debug("%d rows are computed one by one: %s %s", len(part), type(error).__name__, error)
         for row in part.tolist():
             try:
-                found.append(
-                    Alike(torch.tensor([row], dtype=torch.int64, device="cpu"), in_row(row, count, function))
-                )
+                alone = torch.tensor([row], dtype=torch.int64, device="cpu")
+                found.append(Alike(alone, in_row(row, count, function), together=False))
             except Exception as error:
                 failed[row] = error
                 break
