@@ -84,6 +84,7 @@ class StaFBasis(nn.Module, metaclass=Rowwise):
     """
 
     rowwise: ClassVar = {
+        "forward": (2, 1),
         "gram": (1,),
         "ideal_weights": (1,),
         "excess": (1, 1),
