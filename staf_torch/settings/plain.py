@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Mapping, Sequence
 from typing import Any, overload
 
@@ -49,6 +50,7 @@ class ManySettings(Sequence[DictConfig]):
     def __init__(self, settings: Sequence[DictConfig | PlainSettings]) -> None:
         self._settings = list(settings)
         self._made: dict[int, DictConfig] = {}
+        self._first: tuple[PlainSettings, bytes] | None = None  # of which the others are changed copies
 
     def __len__(self) -> int:
         return len(self._settings)
@@ -65,8 +67,16 @@ class ManySettings(Sequence[DictConfig]):
         index = range(len(self))[index]
         found = self._settings[index]
         if isinstance(found, PlainSettings):
-            found = self._made[index] = self._made.get(index) or found.hydras()
+            found = self._made[index] = self._made.get(index) or self._hydras(found)
         return found
+
+    def _hydras(self, settings: PlainSettings) -> DictConfig:
+        """Return settings as OmegaConf has them, in a fifth of the time where they are like the first."""
+        if self._first is None:
+            self._first = settings, pickle.dumps(settings.hydras())
+        first, content = self._first
+        found: DictConfig = pickle.loads(content)
+        return found if _changed(found, settings, first) else settings.hydras()
 
     def of(self, indices: Sequence[int]) -> ManySettings:
         """Return those of some jobs."""
@@ -75,6 +85,19 @@ class ManySettings(Sequence[DictConfig]):
     def read(self) -> Sequence[DictConfig | PlainSettings]:
         """Return the settings of every job, plain where that is possible."""
         return self._settings
+
+
+def _changed(node: DictConfig, now: PlainSettings, then: PlainSettings) -> bool:
+    """Set what is otherwise in a node of the settings `then`; return whether both have the same names."""
+    if list(now) != list(then):
+        return False
+    for name, value in now.items():
+        if isinstance(value, PlainSettings) and isinstance(then[name], PlainSettings):
+            if value is not then[name] and not _changed(node[name], value, then[name]):
+                return False
+        elif value is not then[name]:
+            node[name] = plain(value)
+    return True
 
 
 def to_read(cfgs: Sequence[DictConfig]) -> Sequence[DictConfig | PlainSettings]:
