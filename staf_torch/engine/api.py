@@ -22,6 +22,7 @@ from .predictors import Predictor
 from .problem import Problem
 from .quantities import Known, know, numbers, precompute, with_certificate
 from .recursion import Carry, Corrected, Inputs, Recursion, kept_gain, last_weights, lost, recursion, start
+from .repeated import key_of, remember, repeated
 from .result import ChaseResult, ChaseWeights, concatenate
 
 _WORKING_BYTES = 2**26
@@ -70,10 +71,19 @@ def chase(
 
     Source: Rosenfeld et al., section 6.
     """
+    parts, key = (basis, target, law, predictor), None
+    if weights is None:
+        key = key_of(states, parts, inner_steps, bool(certificate), "chase")
+        again = None if key is None else repeated(key)
+        rooms = None if again is None else again.rooms(states)
+        if again is not None and rooms is not None:
+            return again.results(states, rooms)
     problem = Problem("chase", basis, target, law, inner_steps, predictor, certificate)
     problem.check_states(states)
     run = _ChaseRun(problem, states, weights, everything=True)
-    return concatenate([run.results(chunk) for chunk in run.chunks(states)])
+    found = concatenate([run.results(chunk) for chunk in run.chunks(states)])
+    remember(key, run.program, problem, states, everything=True, history=True)
+    return found
 
 
 def chase_pieces(
@@ -142,6 +152,13 @@ def chase_weights(
 
     Source: Rosenfeld et al., section 6.
     """
+    parts, key = (basis, target, law, predictor), None
+    if weights is None:
+        key = key_of(states, parts, inner_steps, bool(history))
+        again = None if key is None else repeated(key)
+        rooms = None if again is None else again.rooms(states)
+        if again is not None and rooms is not None:
+            return again.weights(rooms)
     problem = Problem("chase_weights", basis, target, law, inner_steps, predictor)
     run: _ChaseRun | None = None
     recorded: list[Tensor] = []  # (B, C, M) a chunk
@@ -155,6 +172,8 @@ def chase_weights(
             recorded += [found] if history else []
     if run is None:
         raise ValueError("`chase_weights(states=...)` must have at least one piece of time; got none.")
+    if one:
+        remember(key, run.program, problem, piece, everything=False, history=bool(history))
     if history:
         joined = recorded[0] if len(recorded) == 1 else torch.cat(recorded, dim=1)
         return ChaseWeights(joined, run.carry.diverged_at)
@@ -191,11 +210,12 @@ class _ChaseRun:
         self.carry = over_rows(lambda at, *w: start(problem, at, plain(w[0]) if w else None), states, *given)
         self._first = row_program.first_carry(problem, self.carry)
         self._unit = self._first.unit  # of the last chunk, bit by bit: a row that diverged stays as it was
-        self._program = row_program.program(problem, states, self._first, everything=everything)
+        self.program = row_program.program(problem, states, self._first, everything=everything)
+        self._warns = row_program.settings_of(problem, states, everything)[-1]
 
     def chunks(self, states: Tensor) -> tuple[Tensor, ...]:
         """Return the states (B, T, n) in chunks of time that fit into memory."""
-        if self._program is not None:  # nothing but what it returns is kept
+        if self.program is not None:  # nothing but what it returns is kept
             return (states,)
         length = chunk_length(states.shape[0], self._problem.basis, states.element_size())
         parts: tuple[Tensor, ...] = states.split(length, dim=1)
@@ -203,8 +223,8 @@ class _ChaseRun:
 
     def weights(self, states: Tensor, history: bool) -> Tensor:
         """Return the paper's weights at the states (B, C, n): (B, C, M), or those of the first time alone."""
-        if self._program is not None:
-            recorded = self._compiled(self._program, states, 1 if history else states.shape[1]).weights
+        if self.program is not None:
+            recorded = self._compiled(self.program, states, 1 if history else states.shape[1]).weights
             assert recorded is not None
             return recorded
         self._warned = self._warned or self._problem.basis.check_reach(states, stacklevel=5)
@@ -220,15 +240,10 @@ class _ChaseRun:
     def results(self, states: Tensor) -> ChaseResult:
         """Return everything at the states (B, C, n)."""
         problem = self._problem
-        if self._program is not None:
-            found = self._compiled(self._program, states, 1)
+        if self.program is not None:
+            found = self._compiled(self.program, states, 1)
             assert found.numbers is not None
-            result = found.numbers.result(states, self.carry.diverged_at)
-            if found.certificate is None:
-                return result
-            return with_certificate(
-                result, found.certificate, torch.zeros_like(result.value, dtype=torch.bool)
-            )
+            return found.numbers.result(states, self.carry.diverged_at, found.certificate)
         self._warned = self._warned or problem.basis.check_reach(states, stacklevel=5)
 
         def defined(states: Tensor, carry: Carry) -> tuple[dict[str, Any], Carry]:
@@ -290,7 +305,7 @@ class _ChaseRun:
             diverged_at = torch.where(old >= 0, old, fresh)
         self.carry = after.chase._replace(time=start + states.shape[1], diverged_at=diverged_at)
         self._unit = after.unit
-        if not self._warned:
+        if self._warns and not self._warned:
             self._warned = self._problem.basis.warn_reach(float(after.reach.detach().max()), stacklevel=6)
         found: row_program.Outputs = outputs
         return found

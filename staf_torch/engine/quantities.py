@@ -108,9 +108,11 @@ class Numbers(NamedTuple):
     excess: Tensor
     excess_before: Tensor
 
-    def result(self, state: Tensor, diverged_at: Tensor) -> ChaseResult:
+    def result(
+        self, state: Tensor, diverged_at: Tensor, certificate: Certificate | None = None
+    ) -> ChaseResult:
         """Return them as a result."""
-        return ChaseResult(state=state, diverged_at=diverged_at, **self._asdict())
+        return ChaseResult(state=state, diverged_at=diverged_at, certificate=certificate, **self._asdict())
 
 
 def numbers(

@@ -25,18 +25,18 @@ from .problem import Problem
 from .quantities import Known, Numbers, know, numbers, precompute, unless
 from .recursion import Carry, Corrected, Link, Moment, all_finite, correct
 
-_SHORTEST = 16  # times of a chase that is worth a program, which takes some tenths of a second to trace
+SHORTEST = 16  # times of a chase that is worth a program, which takes some tenths of a second to trace
 _UNROLLED = 8  # centers up to which the Gram matrix is formed; above it stays in its factors
 
 
-_kept = SharedPrograms("a chase")
+kept = SharedPrograms("a chase")
 
 
 class RowCarry(NamedTuple):
     """Carry of the compiled chase from one time to the next."""
 
     chase: Carry
-    reach: Tensor  # (B,) the largest |x| nu(x) so far, which the kernel may warn of
+    reach: Tensor  # (B,) the largest |x| nu(x) so far, of which a caller may warn
     unit: Tensor  # (B,) e^{-log_gain} of the chase
 
 
@@ -54,17 +54,22 @@ class Step:
     Args:
         problem: what is chased.
         everything: whether all results are wanted, or the weights alone.
+        warns: whether the largest |x| nu(x) is found, of which a caller may warn.
     """
 
-    def __init__(self, problem: Problem, everything: bool) -> None:
-        self.problem, self.everything = problem, everything
+    def __init__(self, problem: Problem, everything: bool, warns: bool = True) -> None:
+        self.problem, self.everything, self.warns = problem, everything, warns
 
     def __call__(self, carry: RowCarry, x: Tensor, row: object) -> tuple[RowCarry, Outputs]:
         problem, last = self.problem, carry.chase
         known = know(problem, x, local=self.everything or bool(problem.law.needs))
         structure = known.structure
+        assert isinstance(last.time, Tensor)
+        begins = last.time == 0
         if structure.log_gain is None:  # it never changes: a compiler is told what it is
             last = last._replace(log_gain=known.log_gain)
+        else:  # weights begin in units of the first state
+            last = last._replace(log_gain=torch.where(begins, known.log_gain, last.log_gain))
         gram = _symmetric(structure.scaled()).expand(*x.shape[:-1], problem.basis.count, problem.basis.count)
         found = precompute(problem, known, gram)
         prediction: tuple[Tensor, ...] = ()
@@ -77,14 +82,11 @@ class Step:
         objective = _objective(structure, gram, known.values, found)
         before, now = correct(problem, objective, at, last)
         now = now._replace(states=states)
-        reach = (
-            torch.maximum(carry.reach, self._reach(x))
-            if known.structure.log_gain is not None
-            else carry.reach
-        )
+        warns = self.warns and structure.log_gain is not None
+        reach = torch.maximum(carry.reach, self._reach(x)) if warns else carry.reach
         lost = now.diverged_at >= 0
         # Not of now.log_gain: what follows from x_k alone is found for many times at once.
-        unit = torch.where(lost, carry.unit, (-known.log_gain).exp())
+        unit = torch.where(lost & ~begins, carry.unit, (-known.log_gain).exp())
         kept = RowCarry(now, reach, unit)
         if structure.log_gain is None:
             kept = RowCarry(now._replace(log_gain=carry.chase.log_gain), reach, carry.unit)
@@ -130,6 +132,14 @@ def first_carry(problem: Problem, carry: Carry) -> RowCarry:
     )
 
 
+def settings_of(problem: Problem, states: Tensor, everything: bool) -> tuple[int, bool, bool, bool]:
+    """Return the numbers that decide what a program does.
+
+    The last says whether |x| nu(x) is looked at: not on a device, where a call waits for nothing.
+    """
+    return problem.inner_steps, problem.certificate, everything, served((states,)) is True
+
+
 def program(problem: Problem, states: Tensor, carry: RowCarry, *, everything: bool) -> Program | None:
     """Return the program of a chase, None where the definition serves.
 
@@ -141,11 +151,11 @@ def program(problem: Problem, states: Tensor, carry: RowCarry, *, everything: bo
         carry: what it starts from.
         everything: whether all results are wanted, or the weights alone.
     """
-    if not worth(states.shape[1] >= _SHORTEST) or not served((states, carry.chase.weights)):
+    if not worth(states.shape[1] >= SHORTEST) or not served((states, carry.chase.weights)):
         return None
-    settings = problem.inner_steps, problem.certificate, everything
+    settings = settings_of(problem, states, everything)
     owners = problem.basis, problem.target, problem.law, problem.predictor, *settings
-    made = _kept.unchanged(*owners)
+    made = kept.unchanged(*owners)
     if made is None:
 
         def make(
@@ -153,10 +163,10 @@ def program(problem: Problem, states: Tensor, carry: RowCarry, *, everything: bo
         ) -> Step:
             other = copy.copy(problem)  # which was checked
             vars(other).update(basis=basis, target=target, law=law, predictor=predictor)
-            return Step(other, everything)
+            return Step(other, everything, settings[-1])
 
         parts = problem.basis, _plain(problem.target), problem.law, problem.predictor, settings
-        made = _kept.of(make(*parts), *parts, owners=owners, make=make)
+        made = kept.of(make(*parts), *parts, owners=owners, make=make)
     return made if made.compiles(carry, states) else None
 
 

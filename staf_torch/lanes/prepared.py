@@ -69,6 +69,19 @@ class Prepared:
         rooms = iter(self.plan(leaves))
         return unflatten(self._carry, rooms), unflatten(self.plan.structure, rooms)
 
+    def planned(self, leaves: Sequence[Any]) -> Plan | None:
+        """Return the plan of the compiled call, made now if there is none; None where the definition runs.
+
+        Args:
+            leaves: of the row, of the times and of the carry, of the forms that the call is prepared for.
+        """
+        where = ordinary(leaves)
+        if self.plan is None and where and not self._refused:
+            row, now, carry = unflatten(self._structure, iter(leaves))
+            given = Given.of(carry, now, row, self._steps)
+            self.plan, self._where = self._planned(given, leaves, where), where
+        return self.plan
+
     def _otherwise(self, leaves: Sequence[Any], carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
         """Run with gradients, or by the definition where no compiled code serves."""
         if not self._refused and torch.is_grad_enabled() and not seen_by_others():

@@ -368,6 +368,10 @@ class Program(Derived):
                 say(self.name, f"its step {self._refused}")
         return self._refused is None
 
+    def has_rows(self) -> bool:
+        """Return whether numbers of a row's own are among what compiled code reads."""
+        return any(built is not None and built.compiled.rows for built in self._compiled.values())
+
     def differentiated(self) -> bool:
         """Return whether a gradient by a tensor that the step found elsewhere is wanted."""
         return torch.is_grad_enabled() and any(map(_REQUIRES, self._tensors))

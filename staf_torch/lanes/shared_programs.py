@@ -164,4 +164,4 @@ def _forget(held: dict[Hashable, Any], most: int) -> None:
 
 
 def _identities(owners: tuple[Any, ...]) -> Hashable:
-    return tuple(each if isinstance(each, int | str) else id(each) for each in owners)
+    return tuple(each if isinstance(each, int | float | str) else id(each) for each in owners)

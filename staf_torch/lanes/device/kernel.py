@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import struct
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, Protocol
 
 import torch
@@ -95,7 +95,9 @@ class DeviceCall:
         read = [self._input(k, *given) for k, given in enumerate(zip(leaves, times, strict=True))]
         self.direct = not self._copied and not any(type(leaf) is Shared for leaf in leaves)
         recorded = -(-steps // every)
-        self._rooms = [((rows, *s), (1, *inner_strides(s, rows)), dtype) for s, dtype in compiled.carry]
+        self._rooms: list[Any] = [
+            ((rows, *s), (1, *inner_strides(s, rows)), dtype) for s, dtype in compiled.carry
+        ]
         for s, dtype in compiled.outputs:
             strides = 1, s.numel() * rows, *inner_strides(s, rows)
             self._rooms.append(((rows, recorded, *s), strides, dtype))
@@ -145,11 +147,20 @@ class DeviceCall:
         for k in self._copied:
             given[k] = given[k].to(self._where).contiguous()
         where, empty = self._where, torch.empty_strided
-        rooms = [empty(shape, strides, dtype=dtype, device=where) for shape, strides, dtype in self._rooms]
+        rooms: list[Any] = [
+            None if room is None else empty(room[0], room[1], dtype=room[2], device=where)
+            for room in self._rooms
+        ]
+        addresses = [0 if room is None else room.data_ptr() for room in rooms]
         with self._lock:  # the driver copies the structure when it is called
-            self._pack(self._record, 0, *map(_address, given), *map(_address, rooms))
+            self._pack(self._record, 0, *map(_address, given), *addresses)
             self._device.launch(self._kernel, self._reference, self._rows)
         return rooms
+
+    def leave_out(self, ends: Collection[int]) -> None:
+        """Write nothing of these of the carry: None is in their place from now on."""
+        for k in ends:
+            self._rooms[k] = None
 
     def _with_columns(self, leaves: Sequence[Any]) -> Sequence[Any]:
         if not self._compiled.rows:

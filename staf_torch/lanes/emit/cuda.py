@@ -215,14 +215,15 @@ class _CudaWriter(ScalarWriter, TableWriter):
 
     def _end(self, slot: int, start: int, nodes: Sequence[int]) -> None:
         name, dtype = f"call.{self._all.carries[slot]}_end", self._dtypes.carries[slot]
-        if slot in self._in_memory:
-            value = _as(dtype, self.real, f"S{slot}[p]", self.graph.type[nodes[0]])
-            loop = f"for (int p = 0; p < {len(nodes)}; ++p)"
-            self._line(f"{loop} {name}[(OFFSET)p * rows + r] = {value};")
-            return
-        for e, node in enumerate(nodes):
-            value = _as(dtype, self.real, f"s{start + e}", self.graph.type[node])
-            self._line(f"{name}[{_times('rows', e)}r] = {value};")
+        with self._braces(f"if ({name})"):
+            if slot in self._in_memory:
+                value = _as(dtype, self.real, f"S{slot}[p]", self.graph.type[nodes[0]])
+                loop = f"for (int p = 0; p < {len(nodes)}; ++p)"
+                self._line(f"{loop} {name}[(OFFSET)p * rows + r] = {value};")
+                return
+            for e, node in enumerate(nodes):
+                value = _as(dtype, self.real, f"s{start + e}", self.graph.type[node])
+                self._line(f"{name}[{_times('rows', e)}r] = {value};")
 
     def _write_outputs(self, outputs: Sequence[int]) -> None:
         if not outputs:
