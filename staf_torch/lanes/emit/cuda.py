@@ -35,8 +35,10 @@ _OF_C = {
     torch.uint8: "unsigned char",
     torch.bool: "unsigned char",
 }
-_LOOP = re.compile(r"for \(int [pq]\w* = \d+; [pq]\w* < (\d+);")
+_LOOP = re.compile(r"for \(int ([pq]\w*) = \d+; [pq]\w* < (\d+);")
 _UNROLLED = 16  # passes over an array that a compiler may write out
+_WHOLE = 36  # entries that it is to write out, so that they may be in registers
+_KNOWN = 256  # numbers of an array that it knows, where a pass that is written out has one of them
 _PRELUDE = """#ifndef NAN
 #define NAN __int_as_float(0x7fffffff)
 #endif
@@ -120,9 +122,11 @@ class _CudaWriter(ScalarWriter, TableWriter):
         ]
 
     def _line(self, text: str) -> None:
-        """A line; of a loop over an array of many entries a compiler is not to write out all passes."""
+        """A line; a loop over few entries is written out by the compiler, one over many is not."""
         loop = _LOOP.match(text)
-        if loop and int(loop[1]) > _UNROLLED:
+        if loop and loop[1] in ("p", "q") and int(loop[2]) <= _WHOLE:
+            super()._line("#pragma unroll")
+        elif loop and int(loop[2]) > _UNROLLED:
             super()._line("#pragma unroll 4")
         super()._line(text)
 
@@ -133,8 +137,11 @@ class _CudaWriter(ScalarWriter, TableWriter):
         written = [*values]
         size = len(written) * _SIZES[kind]
         fits = self._held + size <= _CONSTANT
-        self._held += size if fits else 0
-        memory = "__constant__" if fits else "__device__ const"
+        if len(written) <= _KNOWN:
+            memory = "__device__ constexpr"
+        else:
+            self._held += size if fits else 0
+            memory = "__constant__" if fits else "__device__ const"
         self._constants.append(f"{memory} {kind} {name}[] = {{{', '.join(written)}}};")
 
     # Numbers that are read.
