@@ -121,7 +121,8 @@ def mixed(rows: int, dtype: torch.dtype) -> Case:
     return of_program(lanes.Program(step), x, torch.zeros(rows, 30, dtype=dtype), (), times=30)
 
 
-RADIUS = {3: 0.3, 6: 0.5, 15: 0.8}
+RADIUS = {3: 1.0, 6: 1.5, 15: 2.4}
+"""Radii of the centers at which the Gram matrices are well conditioned, and a rounding stays one."""
 LAWS: dict[str, Callable[[], optim.UpdateLaw]] = {
     "SteepestDescent": optim.SteepestDescent,
     "Nesterov": optim.Nesterov,
@@ -139,8 +140,9 @@ LAWS: dict[str, Callable[[], optim.UpdateLaw]] = {
 
 @functools.cache
 def circles(rows: int, times: int, dtype: torch.dtype) -> Tensor:
-    """Circles of radii 0.5 to 1.5, (B, T, 2) contiguous."""
-    radius, phase = torch.linspace(0.5, 1.5, rows), torch.linspace(0, 6, rows)
+    """Circles of radii 0.1 to 0.4, (B, T, 2) contiguous; the first are the same however many there are."""
+    row = torch.arange(rows, dtype=torch.float64)
+    radius, phase = 0.1 + 0.3 * (0.37 * row).frac(), 6 * (0.61 * row).frac()
     angle = phase.unsqueeze(1) + 0.01 * torch.arange(times)
     return (radius[:, None, None] * torch.stack((angle.cos(), -angle.sin()), dim=-1)).to(dtype).contiguous()
 
@@ -202,7 +204,7 @@ def lorenz(x: Tensor, now: Any, row: Tensor) -> tuple[Tensor, tuple[()]]:
 
 def lorenzes(rows: int, dtype: torch.dtype) -> Case:
     x0 = torch.tensor([1.0, 0.0, 0.0], dtype=dtype).expand(rows, 3)
-    rho = torch.linspace(0.0, 21.0, rows, dtype=dtype)
+    rho = (21 * (0.37 * torch.arange(rows, dtype=torch.float64)).frac()).to(dtype)
     return of_program(lanes.Program(lorenz), x0, (), rho, steps=1000, times=1000)
 
 
