@@ -12,7 +12,6 @@ The library's own code, Python's and that of installed packages stands as it is.
 from __future__ import annotations
 
 import copyreg
-import dis
 import functools
 import hashlib
 import io
@@ -22,17 +21,18 @@ import operator
 import pickle
 import sys
 import sysconfig
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from itertools import chain
 from operator import is_
 from pathlib import Path
 from types import BuiltinFunctionType, CellType, CodeType, FunctionType, MethodType, ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from .lookups import EMPTY, Lookup, attribute_parts, content_of, lookups
 from .row_numbers import RowNumbers, all_rows
 
 _PACKAGE = __name__.partition(".")[0]
@@ -47,15 +47,12 @@ _FIXED = (
     *(FunctionType, BuiltinFunctionType, MethodType),
 )
 _CODE = (type, FunctionType, BuiltinFunctionType)
-_SIMPLE = (int, float, complex, str, bytes, tuple, list, dict, set, frozenset, Tensor)
 _OF_EVERY_MODULE = frozenset(vars(nn.Module()))  # looked into by themselves
 _READ = ("training", "_parameters", "_buffers", "_modules", "_forward_hooks", "_forward_pre_hooks")
 IDLE = _OF_EVERY_MODULE - {*_READ}  # hooks of derivatives and of state_dicts, and what goes with other hooks
 _log = logging.getLogger(__name__)
 _said: set[tuple[str, str]] = set()  # what has been logged
-_MISSING = object()
 _TOLD = "a number of the table"
-_EMPTY = object()  # in a cell whose name has no value yet
 _REQUIRES, _VERSION = operator.attrgetter("requires_grad"), operator.attrgetter("_version")
 _BASE, _ARRAY = operator.itemgetter(*_READ), operator.methodcaller("tobytes")
 BOUND = "_compiled_methods"
@@ -227,7 +224,7 @@ class Contents:
         walk = self._walk
         codes = ((part.__code__, part.__defaults__) for part in walk.functions)  # an editor may reload them
         read = (lookup.value for lookup in walk.lookups)
-        cells = map(_content_of, walk.cells)
+        cells = map(content_of, walk.cells)
         return chain(chain.from_iterable(self._views), own, read, cells, chain.from_iterable(codes))
 
 
@@ -268,65 +265,6 @@ class _Same:
         return id(self.value)
 
 
-class _Lookup(NamedTuple):
-    """A name that code looks up in the globals of its module, or in a module that it found there."""
-
-    space: dict[str, Any]
-    name: str
-
-    @property
-    def value(self) -> Any:
-        return self.space.get(self.name, _MISSING)
-
-
-def _lookups(function: FunctionType) -> Iterator[_Lookup]:
-    """Yield what a function looks up by name: its globals, and attributes of modules there or in its closure.
-
-    An attribute counts for every module that the function knows; too many do no harm.
-    """
-    names, attributes = _names(function.__code__)
-    closed_over = map(_content_of, function.__closure__ or ())
-    spaces = [(function.__globals__, names)]
-    spaces += [(vars(part), attributes) for part in closed_over if isinstance(part, ModuleType)]
-    seen = {id(space) for space, _ in spaces}
-    while spaces:
-        space, names = spaces.pop()
-        for name in names:
-            if name in space:
-                value = space[name]
-                yield _Lookup(space, name)
-            else:
-                value = sys.modules.get(name)  # an import inside of the function
-            if isinstance(value, ModuleType) and id(vars(value)) not in seen:
-                seen.add(id(vars(value)))
-                spaces.append((vars(value), attributes))
-
-
-@functools.lru_cache(maxsize=4096)
-def _names(code: CodeType) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The names that code and the code inside of it look up, and the attributes that it asks for."""
-    names, attributes = dict[str, None](), dict[str, None]()
-    for instruction in dis.get_instructions(code):
-        if instruction.opname in ("LOAD_GLOBAL", "LOAD_NAME", "IMPORT_NAME"):
-            names[instruction.argval.partition(".")[0]] = None
-        if instruction.opname in ("LOAD_ATTR", "LOAD_METHOD", "IMPORT_FROM", "IMPORT_NAME"):
-            attributes.update(dict.fromkeys(instruction.argval.split(".")))
-    for part in code.co_consts:
-        if isinstance(part, CodeType):
-            inner, asked = _names(part)
-            names.update(dict.fromkeys(inner))
-            attributes.update(dict.fromkeys(asked))
-    return tuple(names), tuple(attributes)
-
-
-def _content_of(cell: CellType) -> Any:
-    """Return the content of a closure's cell, or `_EMPTY`."""
-    try:
-        return cell.cell_contents
-    except ValueError:
-        return _EMPTY
-
-
 class Walk(pickle.Pickler):
     """Writes everything but floating-point tensors, and notes what may change later."""
 
@@ -343,7 +281,7 @@ class Walk(pickle.Pickler):
         self.lists: list[list[Any]] = []
         self.sets: list[set[Any]] = []
         self.arrays: list[np.ndarray[Any, Any]] = []
-        self.lookups: list[_Lookup] = []
+        self.lookups: list[Lookup] = []
         self.cells: list[CellType] = []
         self.functions: list[FunctionType] = []
         self.of_users = False
@@ -365,12 +303,12 @@ class Walk(pickle.Pickler):
         parts: list[Any] = [function.__defaults__, function.__kwdefaults__, vars(function)]
         for cell in function.__closure__ or ():
             self.cells.append(cell)
-            content = _content_of(cell)
-            if content is _EMPTY or (isinstance(content, ModuleType) and is_users(function)):
+            content = content_of(cell)
+            if content is EMPTY or (isinstance(content, ModuleType) and is_users(function)):
                 self.kept.append(_Same(content))  # and what the function asks a module for, below
             else:
                 parts.append(content)
-        for lookup in _lookups(function) if is_users(function) else ():
+        for lookup in lookups(function) if is_users(function) else ():
             self.lookups.append(lookup)
             value = lookup.value
             parts.append(lookup.name)
@@ -503,15 +441,4 @@ class Walk(pickle.Pickler):
 def _class_parts(kind: type) -> tuple[Any, ...]:
     """Return what a user's base classes hold: functions, numbers, containers."""
     users = [vars(each).items() for each in kind.__mro__ if is_users(each)]
-    return tuple(part for items in users for name, value in items for part in _attribute_parts(name, value))
-
-
-def _attribute_parts(name: str, value: Any) -> Iterable[Any]:
-    """Return the parts of a class attribute that a step may read: functions, or itself."""
-    if isinstance(value, property):
-        return [part for part in (value.fget, value.fset, value.fdel) if part is not None]
-    value = getattr(value, "__func__", value)  # of a static or class method
-    known = (
-        FunctionType if name.startswith("__") else (FunctionType, *_SIMPLE)
-    )  # not annotations and the like
-    return [value] if isinstance(value, known) else []
+    return tuple(part for items in users for name, value in items for part in attribute_parts(name, value))

@@ -1,0 +1,85 @@
+"""What code looks up by name: globals of its module, attributes of modules and classes that it finds there."""
+
+from __future__ import annotations
+
+import dis
+import functools
+import sys
+from collections.abc import Iterable, Iterator
+from types import CellType, CodeType, FunctionType, ModuleType
+from typing import Any, NamedTuple
+
+from torch import Tensor
+
+_SIMPLE = (int, float, complex, str, bytes, tuple, list, dict, set, frozenset, Tensor)
+_MISSING = object()
+EMPTY = object()
+"""In a cell whose name has no value yet."""
+
+
+class Lookup(NamedTuple):
+    """A name that code looks up in the globals of its module, or in a module that it found there."""
+
+    space: dict[str, Any]
+    name: str
+
+    @property
+    def value(self) -> Any:
+        return self.space.get(self.name, _MISSING)
+
+
+def lookups(function: FunctionType) -> Iterator[Lookup]:
+    """Yield what a function looks up by name: its globals, and attributes of modules there or in its closure.
+
+    An attribute counts for every module that the function knows; too many do no harm.
+    """
+    names, attributes = _names(function.__code__)
+    closed_over = map(content_of, function.__closure__ or ())
+    spaces = [(function.__globals__, names)]
+    spaces += [(vars(part), attributes) for part in closed_over if isinstance(part, ModuleType)]
+    seen = {id(space) for space, _ in spaces}
+    while spaces:
+        space, names = spaces.pop()
+        for name in names:
+            if name in space:
+                value = space[name]
+                yield Lookup(space, name)
+            else:
+                value = sys.modules.get(name)  # an import inside of the function
+            if isinstance(value, ModuleType) and id(vars(value)) not in seen:
+                seen.add(id(vars(value)))
+                spaces.append((vars(value), attributes))
+
+
+@functools.lru_cache(maxsize=4096)
+def _names(code: CodeType) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The names that code and the code inside of it look up, and the attributes that it asks for."""
+    names, attributes = dict[str, None](), dict[str, None]()
+    for instruction in dis.get_instructions(code):
+        if instruction.opname in ("LOAD_GLOBAL", "LOAD_NAME", "IMPORT_NAME"):
+            names[instruction.argval.partition(".")[0]] = None
+        if instruction.opname in ("LOAD_ATTR", "LOAD_METHOD", "IMPORT_FROM", "IMPORT_NAME"):
+            attributes.update(dict.fromkeys(instruction.argval.split(".")))
+    for part in code.co_consts:
+        if isinstance(part, CodeType):
+            inner, asked = _names(part)
+            names.update(dict.fromkeys(inner))
+            attributes.update(dict.fromkeys(asked))
+    return tuple(names), tuple(attributes)
+
+
+def content_of(cell: CellType) -> Any:
+    """Return the content of a closure's cell, or `EMPTY`."""
+    try:
+        return cell.cell_contents
+    except ValueError:
+        return EMPTY
+
+
+def attribute_parts(name: str, value: Any) -> Iterable[Any]:
+    """Return the parts of a class attribute that a step may read: functions, or itself."""
+    if isinstance(value, property):
+        return [part for part in (value.fget, value.fset, value.fdel) if part is not None]
+    value = getattr(value, "__func__", value)  # of a static or class method
+    known = FunctionType if name.startswith("__") else (FunctionType, *_SIMPLE)  # no annotations
+    return [value] if isinstance(value, known) else []
