@@ -28,16 +28,19 @@ class RowsOfJobs:
     Args:
         kinds: of each job, the row of the numbers of its objects.
         counts: rows of each job.
+
+    Attributes:
+        differ: whether jobs have numbers of their own.
     """
 
     def __init__(self, kinds: Sequence[int], counts: Sequence[int]) -> None:
-        self._differ = len(set(kinds)) > 1
+        self.differ = len(set(kinds)) > 1
         kind, count = (torch.tensor(each, dtype=torch.int64, device="cpu") for each in (kinds, counts))
         self._kind = kind.repeat_interleave(count)
 
     def of(self, rows: slice = slice(None)) -> contextlib.AbstractContextManager[None]:
         """Batches of the block hold these rows of the call."""
-        return some_rows(self._kind[rows]) if self._differ else contextlib.nullcontext()
+        return some_rows(self._kind[rows]) if self.differ else contextlib.nullcontext()
 
 
 def in_calls(objects: Sequence[Objects], counts: Sequence[int], call: Call, *, apart: bool = False) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import Any, NamedTuple
 
 import torch
@@ -12,7 +13,7 @@ from ..centers import probe_points
 from ..lanes import Program, reduce, shared_program
 from ..lanes.compiled_methods import undecided, worth
 from ..lanes.plain_time import PlainTime
-from ..lanes.row_numbers import over_rows, points_of_rows, some_rows
+from ..lanes.row_numbers import RowNumbers, over_rows, points_of_rows, some_rows
 from ..lanes.row_objects import made_by_rows
 from ..local_basis import NewtonSpace, evaluate_scaled, scale
 from ..numerics.linalg import condition_number
@@ -76,26 +77,42 @@ class StateErrorPass:
         if self._fixed is None:
             with some_rows(None):
                 self._fixed = made_by_rows(lambda: _Fixed.of(self._basis, x, self._points))
-        times = x.shape[-2] if x.dim() > 2 else 1
         self._seen += x.numel() // x.shape[-1]
-        if self._pays():
-            row = tuple(part.reshape(-1, part.shape[-1]) for part in (x, coefficients, ideal))
-            if self._program is None:
-                parts = self._basis, self._target, self._fixed
-                self._program = shared_program(
-                    "the errors on a ball", lambda _, __, row: ((), self._at(*row)), *parts
-                )
-            with points_of_rows(len(row[0]) // times, times):
-                self.compiled = self._program.compiles((), (), row, steps=1)
-                if self.compiled:
-                    found: tuple[Tensor, ...] = self._program((), (), row, steps=1)[1]
-                    return StateErrors(*(part.reshape(x.shape[:-1]) for part in found))
+        found = self._compiled(x, coefficients, ideal) if self._pays() else None
+        if found is not None:
+            return found
         width = self._points * self._basis.count
         times = max(1, _BLOCK // (width * max(1, x.numel() // x.shape[-1] // x.shape[-2])))
         blocks = zip(*(part.split(times, dim=-2) for part in (x, coefficients, ideal)), strict=True)
         errors = [self._counted(next(blocks)), *(over_rows(self._at, *block) for block in blocks)]
         columns = zip(*errors, strict=True)
         return StateErrors(*(torch.cat(column, dim=-1) for column in columns))
+
+    def _compiled(self, *given: Tensor) -> StateErrors | None:
+        """The errors at the states by a program; None where it cannot be compiled."""
+        shape = given[0].shape[:-1]
+        assert self._fixed is not None
+        # What is fixed for a row's own numbers comes once a row: its states are times.
+        timed = isinstance(self._fixed.core, RowNumbers) and len(shape) == 2
+        if self._program is None:
+            parts = self._basis, self._target, self._fixed
+            name = "the errors on balls of rows" if timed else "the errors on a ball"
+
+            def step(_: Any, now: Any, row: Any) -> Any:
+                return (), self._at(*(now if timed else row))
+
+            self._program = shared_program(name, step, *parts)
+        times = shape[-1] if len(shape) > 1 else 1
+        row = () if timed else tuple(part.reshape(-1, part.shape[-1]) for part in given)
+        steps = times if timed else 1
+        points = contextlib.nullcontext() if timed else points_of_rows(shape.numel() // times, times)
+        with points:
+            call = (), given if timed else (), row
+            self.compiled = self._program.compiles(*call, steps=steps)
+            if not self.compiled:
+                return None
+            found: tuple[Tensor, ...] = self._program(*call, steps=steps)[1]
+        return StateErrors(*(part.reshape(shape) for part in found))
 
     def _pays(self) -> bool:
         pays = self._seen >= _PAYS or self._seen * self._share >= 1
@@ -171,11 +188,13 @@ class _Fixed(NamedTuple):
     def of(cls, basis: StaFBasis, x: Tensor, points: int) -> _Fixed:
         """For states (..., T, n) and what follows them in the same rows."""
         probes = probe_points(points, basis.dim).to(x)
-        origin = torch.zeros_like(x[..., :1, :]).expand(*x.shape[:-2], 2, -1)
-        offsets, core = basis.centers.offsets(origin), basis.gram_structure(origin).core
-        if any(part.dim() > 2 and part.shape[-3] > 1 for part in (offsets, core)):
-            return cls(probes, None, None)
-        origin = origin[..., :1, :] if offsets.dim() > 2 or core.dim() > 2 else origin.new_zeros(basis.dim)
+        origin = x.new_zeros(basis.dim)
+        if not (basis.kernel.state_free and basis.centers.radius.constant):
+            two = torch.zeros_like(x[..., :1, :]).expand(*x.shape[:-2], 2, -1)
+            parts = basis.centers.offsets(two), basis.gram_structure(two).core
+            if any(part.dim() > 2 and part.shape[-3] > 1 for part in parts):
+                return cls(probes, None, None)
+            origin = two[..., :1, :] if any(part.dim() > 2 for part in parts) else origin
         space, z = basis.local(origin), basis.centers.radius(origin)[..., None, None] * probes
         # A Newton space has none: its coefficients are nodal values, and cardinal functions, one by one,
         # lose the digits that a smooth V keeps.
