@@ -134,8 +134,9 @@ class StaFBasis(nn.Module, metaclass=Rowwise):
         trailing("StaFBasis", "y", y, dims=2, last=self.dim)
         if self._unseen and _same(y, x):
             self.check_own_value(x.detach(), stacklevel=5)
-        sigma: Tensor = self.kernel(y, self.centers(x)).to(torch.promote_types(y.dtype, x.dtype))
-        return sigma
+        sigma: Tensor = self.kernel(y, self.centers(x))
+        real = y.dtype if y.dtype is x.dtype else torch.promote_types(y.dtype, x.dtype)
+        return sigma if sigma.dtype is real else sigma.to(real)
 
     def gram(self, x: Tensor) -> Tensor:
         """K(c(x)): (..., n) -> (..., M, M). Overflows with the kernel; see `gram_structure`."""

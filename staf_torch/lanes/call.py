@@ -98,7 +98,7 @@ def ordinary(leaves: Sequence[Any], *, recorded: bool | None = None) -> Where:
         return False
     recorded = torch.is_grad_enabled() if recorded is None else recorded
     for leaf in leaves:
-        tensor = plain(leaf)
+        tensor = leaf.tensor if type(leaf) is Shared else leaf
         if type(tensor) not in _TENSORS or (recorded and tensor.requires_grad) or tensor.is_neg():
             return False
         if not tensor.is_cpu:
@@ -152,6 +152,8 @@ def at_once(x: Tensor) -> bool:
 
 def form(leaf: Any) -> Form:
     """Return what a plan must know about an input."""
+    if type(leaf) is Tensor and leaf.is_cpu:  # most of all
+        return leaf.shape, leaf.stride(), leaf.dtype, False
     tensor = plain(leaf)
     shared = type(leaf) is Shared
     place = shared if tensor.is_cpu else (shared, tensor.device)

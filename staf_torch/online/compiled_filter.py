@@ -193,16 +193,22 @@ class DirectCalls:
 
     def learn(self, x: Any, y: Any) -> bool:
         """Learn one sample a stream; False where it does not fit, or the streams are just changed."""
-        return (
-            in_place(x, self._dtype, self._shape)
-            and in_place(y, self._dtype, self._targets)
-            and self._run(_packed(self._reference, 6, x.data_ptr(), y.data_ptr(), 0, 0, 0)) == 1
-        )
+        try:
+            return (
+                in_place(x, self._dtype, self._shape)
+                and in_place(y, self._dtype, self._targets)
+                and self._run(_packed(self._reference, 6, x.data_ptr(), y.data_ptr(), 0, 0, 0)) == 1
+            )
+        except RuntimeError:  # under a transform of torch.func there is no address
+            return False
 
     def predict(self, x: Any) -> tuple[Tensor, Tensor] | None:
         """Mean and standard deviation of the next y; None where `learn` returns False."""
         if not in_place(x, self._dtype, self._shape):
             return None
         mean, deviation = x.new_empty(self._targets), x.new_empty(self._targets)
-        places = x.data_ptr(), 0, 0, mean.data_ptr(), deviation.data_ptr()
+        try:
+            places = x.data_ptr(), 0, 0, mean.data_ptr(), deviation.data_ptr()
+        except RuntimeError:  # under a transform of torch.func there is none
+            return None
         return (mean, deviation) if self._run(_packed(self._reference, 5, *places)) == 1 else None

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..lanes.call import seen_by_others
 from ..lanes.locks import ReadWriteLock
 from ..lanes.opaque import opaque
 from ..numerics.checks import fail, integer, trailing
@@ -146,6 +147,7 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
     def _partial_fit(self, x: Any, y: Any, lapse: Any) -> None:
         if (
             lapse is None
+            and not seen_by_others()
             and in_place(x, self._in_place_, self._shape_)
             and in_place(y, self._in_place_, self._targets_)
         ):
@@ -209,7 +211,7 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
                 direct.reopen()
 
     def _predict(self, x: Any, return_std: bool) -> Any:
-        if in_place(x, self._in_place_, self._shape_):
+        if not seen_by_others() and in_place(x, self._in_place_, self._shape_):
             mean, deviation = self._streams_.predict(x, self._targets_)
             return (mean, deviation) if return_std else mean
         points = trailing(self._call("predict"), "x", tensor_of(self._call("predict"), "x", x), 1)

@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..lanes.call import at_once
 from ..lanes.gradients import refuse_gradient
 from ..numerics.checks import fail
 
@@ -56,8 +55,10 @@ def in_place(value: Any, dtype: torch.dtype | None, shape: tuple[int, ...]) -> b
         type(value) is Tensor
         and value.dtype is dtype
         and value.shape == shape
+        and value.is_cpu
+        and not value.requires_grad
         and value.is_contiguous()
-        and at_once(value)
+        and not value.is_neg()
     )
 
 

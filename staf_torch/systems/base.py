@@ -17,6 +17,7 @@ from ..numerics.default_device import device_of
 from ..numerics.shown import limits, settings, sizes
 from .bounds import Bounds
 
+_HERE = torch.empty(0, dtype=torch.float64, device="cpu")
 Number = float | Tensor
 """A number, as a tensor without dimensions one of a table, or by `staf_torch.rows` one a row."""
 
@@ -100,8 +101,8 @@ class Plant(nn.Module, metaclass=OfRows):
 
     def __init__(self) -> None:
         super().__init__()
-        where = torch.empty(0, dtype=torch.float64, device="cpu")
-        self.register_buffer("_where", where, persistent=False)  # the device of a plant without numbers
+        self._buffers["_where"] = _HERE  # the device of a plant without numbers, and not persistent
+        self._non_persistent_buffers_set.add("_where")
 
     @property
     def traceable(self) -> bool:
