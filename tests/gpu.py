@@ -251,17 +251,21 @@ TRUTHS: dict[tuple[str, torch.dtype], bytes] = {}
 
 
 def in_a_graph() -> bool:
-    """Whether a graph computes what calls do, also with other numbers in its inputs."""
-    case, _ = on_device("pendulum", torch.float64, 1000)
-    carry, now, row = moved(case.inputs, DEVICE)
-    case.call(carry, now, row)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        found = case.call(carry, now, row)
-    carry.mul_(0.5)
-    graph.replay()
-    wait()
-    return error(found, case.call(carry, now, row)) == 0.0
+    """Whether graphs compute what calls do, also with other numbers in their inputs."""
+    away = 0.0
+    for name in ("pendulum", "few rows"):
+        case, _ = on_device(name, torch.float64, 1000)
+        given = moved(case.inputs, DEVICE)
+        for _ in range(4):
+            case.call(*given)
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            found = case.call(*given)
+        plain_of(given).mul_(0.5)
+        graph.replay()
+        wait()
+        away = max(away, error(found, case.call(*given)))
+    return away == 0.0
 
 
 def on_streams() -> bool:

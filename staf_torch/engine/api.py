@@ -156,7 +156,7 @@ def chase_weights(
     if weights is None:
         key = key_of(states, parts, inner_steps, bool(history))
         again = None if key is None else repeated(key)
-        rooms = None if again is None else again.rooms(states)
+        rooms = again.rooms(states) if again is not None and isinstance(states, Tensor) else None
         if again is not None and rooms is not None:
             return again.weights(rooms)
     problem = Problem("chase_weights", basis, target, law, inner_steps, predictor)

@@ -17,9 +17,10 @@ from ..lanes.contents import is_users
 from ..lanes.device.kernel import DeviceCall
 from ..lanes.tree import flatten, unflatten
 from .problem import Problem
+from .quantities import Numbers
 from .recursion import last_weights, start
 from .result import ChaseResult, ChaseWeights
-from .row_program import SHORTEST, Outputs, RowCarry, first_carry, kept, settings_of
+from .row_program import SHORTEST, first_carry, kept, settings_of
 
 _MOST = 64  # chases that are remembered
 
@@ -51,8 +52,8 @@ class Repeated:
         self.plan, self._where = prepared.planned([states, *self._first]), ordinary((states,))
         if self.plan is None:
             return
-        self._end: RowCarry = unflatten(structure, iter(range(len(leaves))))  # which result is what
-        self._outputs: Outputs = unflatten(self.plan.structure, iter(range(len(leaves), 10**6)))
+        self._end: Any = unflatten(structure, iter(range(len(leaves))))  # which result is what
+        self._outputs: Any = unflatten(self.plan.structure, iter(range(len(leaves), 10**6)))
         settings = settings_of(problem, states, everything)
         self._warns, self._owners = settings[-1], (*_parts(problem), *settings)
         chase = self._end.chase
@@ -90,7 +91,7 @@ class Repeated:
     def results(self, states: Tensor, rooms: Sequence[Any]) -> ChaseResult:
         """Return everything among what the program left behind."""
         numbers, certificate = self._outputs.numbers, self._outputs.certificate
-        found = type(numbers)(*(rooms[k] for k in numbers))
+        found: Numbers = type(numbers)(*(rooms[k] for k in numbers))
         vouched = None if certificate is None else type(certificate)(*(rooms[k] for k in certificate))
         return found.result(states, rooms[self._end.chase.diverged_at], vouched)
 
