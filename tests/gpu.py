@@ -34,7 +34,7 @@ from staf_torch import lanes
 from tests import gpu_cases as cases
 
 FEW, BUILT = 16, 32
-CLOSE, ROUNDED, POSED = 1e-11, 4.0, 5e-3
+CLOSE, ROUNDED, POSED = 1e-12, 4.0, 1e-3
 """What a float64 number may be off by; and by how many times what plain torch's of float32 is,
 which is at most that much."""
 DTYPES = torch.float64, torch.float32
@@ -59,7 +59,10 @@ KINDS: dict[str, tuple[Make, tuple[int, ...]]] = {
     "chase, everything": (cases.everything, (100_000,)),
 }
 for _count, _law in itertools.product((3, 6, 15), cases.LAWS):
-    KINDS.setdefault(f"M = {_count} {_law}", (cases.weights(_count, _law, 16), (100_000,)))
+    # Of more iterations these two make ten digits of a rounding at M = 15.
+    _few = _count == 15 and _law in ("ConjugateGradient", "BarzilaiBorwein")
+    _name = f"M = {_count} {_law}" + ", 2 its" * _few
+    KINDS.setdefault(_name, (cases.weights(_count, _law, 16, 2 if _few else 10), (100_000,)))
 PEERS = 3  # kinds, the first ones, that peers do too
 WITHIN = {"float32 within": 1e-7}
 """float64 cases that compute in float32 inside: a sine of float32 is right to two units."""

@@ -147,14 +147,14 @@ def circles(rows: int, times: int, dtype: torch.dtype) -> Tensor:
     return (radius[:, None, None] * torch.stack((angle.cos(), -angle.sin()), dim=-1)).to(dtype).contiguous()
 
 
-def weights(count: int, law: str, times: int) -> Callable[[int, torch.dtype], Case]:
+def weights(count: int, law: str, times: int, its: int = 10) -> Callable[[int, torch.dtype], Case]:
     def case(rows: int, dtype: torch.dtype) -> Case:
         basis = st.StaFBasis(
             st.ExponentialKernel(), st.StateFollowingCenters(st.rings(count), RADIUS[count])
         ).to(dtype)
         made = LAWS[law]()
         paper = targets.Paper()
-        call = lambda x: st.chase_weights(x, basis, paper, made).weights  # noqa: E731
+        call = lambda x: st.chase_weights(x, basis, paper, made, inner_steps=its).weights  # noqa: E731
         return of_function(call, circles(rows, times, dtype), times=times, parts=(basis, paper))
 
     return case
