@@ -331,7 +331,7 @@ class _Merge:
             self._made[key] = made
             held = [dict(vars(value)) for value in values]
             for key in getattr(kind, "none_is_zero", ()):
-                there = next((each[key] for each in held if each[key] is not None), None)
+                there: Any = next((each[key] for each in held if each[key] is not None), None)
                 for each in held if there is not None else ():
                     each[key] = torch.zeros_like(there) if each[key] is None else each[key]
             vars(made).update(self._dict(held, name))

@@ -138,7 +138,9 @@ class CompiledFilter:
         """The compiled filter, or the definition where there is none."""
         functions, real = definition.functions, _REALS.get(state.dtype)
         own = isinstance(functions, OwnFunctions)
-        plain = own or (functions.rate is not None and functions.shared is not None and functions.stationary)
+        plain = isinstance(functions, OwnFunctions) or (
+            functions.rate is not None and functions.shared is not None and functions.stationary
+        )
         if not plain or real is None or state.count > _MOST or state.blocks.device.type != "cpu":
             return definition
         sizes = f"DIM={state.dim}", f"COUNT={state.count}", f"OUTPUTS={state.outputs}"
