@@ -177,7 +177,7 @@ class GradientCall:
             back: whether from the last time to the first.
             rooms: tensors of the program's dtype to write to, on the CPU; none where they are new.
         """
-        where = given.ordinary()
+        where = True if rooms else given.ordinary()
         nows = given.now if where is True or not back else [flipped(leaf) for leaf in given.now]
         leaves = [*given.row, *own, *nows, *given.carry]
         forms = tuple([(x.shape, x.stride(), x.dtype) for x in map(plain, leaves)])

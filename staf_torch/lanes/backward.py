@@ -70,6 +70,7 @@ class Backward:
         ]
         summed += [(self._captured[k], True) for k in self._of_captured]
         self._summed = [*summed, *((self._own[k], False) for k in self._of_own)]
+        self._structures: dict[str, Any] = {}
         few = slice(0, min(call.rows, _UNIT))
         begin = [leaf[few] for leaf in self._carry]
         given = self._given(few, slice(0, 1), self._slopes(few), [leaf.unsqueeze(1) for leaf in begin], None)
@@ -229,7 +230,7 @@ class Backward:
 
     def _rooms(self, rows: slice, times: slice, at_times: _AtTimes) -> list[Tensor]:
         """Where a block is written to: what times bring has its place among all rows."""
-        if not self._on_processor or not at_times.leaves or self.built is None:
+        if not self._on_processor or self.built is None:
             return []
         like, count = at_times.like, rows.stop - rows.start
         ends = [empty_rows(like, count, (), shape) for shape, _ in self.built.compiled.carry]
@@ -256,15 +257,14 @@ class Backward:
         ends = [self._at(end, rows, times) for end in self._ends if end is not None]
         captured = [Shared(self._captured[k]) for k in self._of_captured]
         own = [self._own[k][rows] for k in self._of_own]
-        trees = {
-            "carry": ([*slopes], [*sums]),
-            "now": ([*before], self._some(self._now, rows, times), ends),
-            "row": (self._some(self._row, rows, None), captured, own),
-        }
-        flat = {name: flatten(tree) for name, tree in trees.items()}
-        structures = {name: structure for name, (_, structure) in flat.items()}
-        leaves = {name: found for name, (found, _) in flat.items()}
-        return Given(**leaves, structures=structures, rows=count, times=times.stop - times.start)
+        carry = [*slopes], [*sums]
+        now = [*before], self._some(self._now, rows, times), ends
+        row = self._some(self._row, rows, None), captured, own
+        if not self._structures:
+            trees = {"carry": carry, "now": now, "row": row}
+            self._structures = {name: flatten(tree)[1] for name, tree in trees.items()}
+        leaves = ([leaf for part in parts for leaf in part] for parts in (carry, now, row))
+        return Given(*leaves, self._structures, count, times.stop - times.start)
 
     @property
     def _device(self) -> torch.device:
