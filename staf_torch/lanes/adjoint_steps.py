@@ -39,7 +39,7 @@ def keeping_step(step: Step) -> Step:
 
     def keeping(carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
         after, out = step(carry, now, row)
-        return after, (out, flatten(carry)[0])
+        return after, (out, tuple(flatten(carry)[0]))
 
     return keeping
 
@@ -93,7 +93,7 @@ def adjoint_step(
             if one
         ]
         total = [before + slope.to(before.dtype) for before, slope in zip(sums, found_slopes, strict=True)]
-        return (earlier, total), at_times
+        return (tuple(earlier), tuple(total)), tuple(at_times)
 
     return adjoint
 
@@ -112,7 +112,7 @@ def deciding(step: Step, given: Given, ends: Sequence[bool], outputs: Sequence[b
     moves = [leaf.is_floating_point() for leaf in given.carry]
     leaves = [x.detach().requires_grad_(real) for x, real in zip(given.carry, moves, strict=True)]
     now = [plain(x)[0] if isinstance(x, Shared) else x[:, 0] for x in given.now]
-    with torch.enable_grad(), _Seen():
+    with torch.enable_grad(), _Seen():  # type: ignore[no-untyped-call]
         after, out = step(
             given.tree("carry", leaves), given.tree("now", now), given.tree("row", [*map(plain, given.row)])
         )
@@ -121,9 +121,9 @@ def deciding(step: Step, given: Given, ends: Sequence[bool], outputs: Sequence[b
     alive = [end and moving for end, moving in zip(ends, moves, strict=True)]
     while True:
         roots = [x for x, one in zip((*following, *made), (*alive, *outputs), strict=True) if one]
-        roots = [root for root in roots if root.requires_grad]
-        ones = [torch.ones_like(root) for root in roots]
-        slopes = torch.autograd.grad(roots, real, ones, True, allow_unused=True) if roots else ()
+        with torch.enable_grad():  # of sums: beside gradients of another shape torch imports SymPy
+            sums = [root.sum() for root in roots if root.requires_grad]
+        slopes = torch.autograd.grad(sums, real, retain_graph=True, allow_unused=True) if sums else ()
         met = iter([slope is not None for slope in slopes] or [False] * len(real))
         reached = [moving and next(met) for moving in moves]
         more = [one or found for one, found in zip(alive, reached, strict=True)]
@@ -135,10 +135,14 @@ def deciding(step: Step, given: Given, ends: Sequence[bool], outputs: Sequence[b
 class _Seen(TorchDispatchMode):
     """Context in which nothing but operations is done, as somebody who traces them wants it."""
 
-    def __torch_dispatch__(
+    def _dispatch(
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
     ) -> Any:
         return func(*args, **kwargs or {})
+
+
+# Set here and not in the class, where torch would wrap the method and import its compiler, seconds.
+_Seen.__torch_dispatch__ = _Seen._dispatch  # type: ignore[assignment]
 
 
 class Substituted(TorchFunctionMode):

@@ -262,9 +262,9 @@ class Backward:
         row = self._some(self._row, rows, None), captured, own
         if not self._structures:
             trees = {"carry": carry, "now": now, "row": row}
-            self._structures = {name: flatten(tree)[1] for name, tree in trees.items()}
-        leaves = ([leaf for part in parts for leaf in part] for parts in (carry, now, row))
-        return Given(*leaves, self._structures, count, times.stop - times.start)
+            self._structures = {n: flatten(tuple(map(tuple, tree)))[1] for n, tree in trees.items()}
+        flat: list[list[Any]] = [[x for part in parts for x in part] for parts in (carry, now, row)]
+        return Given(flat[0], flat[1], flat[2], self._structures, count, times.stop - times.start)
 
     @property
     def _device(self) -> torch.device:
@@ -340,8 +340,9 @@ def empty_rows(like: Tensor, rows: int, times: tuple[int, ...], shape: Sequence[
 
 def some_rows(given: Given, rows: slice) -> Given:
     """Return the inputs of some rows."""
-    leaves = ([x if isinstance(x, Shared) else x[rows] for x in part] for part in given[:3])
-    return Given(*leaves, given.structures, rows.stop - rows.start, given.times)
+    row, now = ([x if isinstance(x, Shared) else x[rows] for x in part] for part in (given.row, given.now))
+    carry = [x[rows] for x in given.carry]
+    return Given(carry, now, row, given.structures, rows.stop - rows.start, given.times)
 
 
 def _units(x: Tensor) -> Tensor:

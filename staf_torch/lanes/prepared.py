@@ -98,7 +98,12 @@ class Prepared:
         if compiled is None:
             return None
         times = [False] * len(given.row) + [True] * len(given.now) + [False] * len(given.carry)
-        sizes = {"rows": given.rows, "steps": given.times, "every": self._every, "once": len(given.row)}
+        sizes: dict[str, Any] = {
+            "rows": given.rows,
+            "steps": given.times,
+            "every": self._every,
+            "once": len(given.row),
+        }
         if isinstance(where, bool):
             return PlannedCall(compiled, leaves, times, **sizes)
         try:

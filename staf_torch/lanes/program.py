@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -316,8 +316,7 @@ class Program(Derived):
 
     def in_place_of(self, tensor: Some) -> Some:
         """Return the tensor that stands where the program that this one follows had another, or itself."""
-        found: Any = tensor if self._model is None else self._model[1].get(id(tensor), tensor)
-        return found
+        return tensor if self._model is None else cast("Some", self._model[1].get(id(tensor), tensor))
 
     def keeping(self, given: Given) -> tuple[Program, Built] | None:
         """Return the program that also puts out the carry before every step, and what was built of it."""
