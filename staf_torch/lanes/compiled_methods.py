@@ -35,6 +35,7 @@ from .prepared import Plan
 from .program import Program
 from .row_numbers import RowNumbers, over_rows, points_of_rows
 from .shared_programs import shared_program
+from .trace.step import Step
 from .tree import Shared, Tree, flatten, plain, unflatten
 
 _PAYS = 100  # calls of a small batch in plain torch after which it is compiled, however short they are
@@ -333,7 +334,7 @@ class CompiledMethod:
             served: Served | None = None
             if settings.by is None:
                 made = self.definition, settings.name, self.definition, self.owner
-                rows = Rows(*made, copies=settings.copies)
+                rows = Rows(*made, copies=settings.copies, make=lambda definition, _: definition)
                 served = _Trees(rows) if trees else rows
             elif not read.wants_gradient():
                 served = settings.by(self.owner)
@@ -403,16 +404,25 @@ class Rows:
         name: in the log.
         parts: all that ``function`` reads, for `shared_program`; none where nothing is to be shared.
         copies: as in `Program`.
+        make: ``function`` from the parts, as in `shared_program`.
     """
 
-    def __init__(self, function: Callable[..., Tree], name: str, *parts: Any, copies: int = 1) -> None:
-        def step(carry: Tree, _: Tree, row: Tree) -> tuple[Tree, Tree]:
-            return carry, function(*row)
+    def __init__(
+        self,
+        function: Callable[..., Tree],
+        name: str,
+        *parts: Any,
+        copies: int = 1,
+        make: Callable[..., Callable[..., Tree]] | None = None,
+    ) -> None:
+        def step_of(function: Callable[..., Tree]) -> Step:
+            return lambda carry, _, row: (carry, function(*row))
 
         if parts:
-            self.program = shared_program(name, step, *parts, copies=copies)
+            told = None if make is None else (lambda *others: step_of(make(*others)))
+            self.program = shared_program(name, step_of(function), *parts, copies=copies, make=told)
         else:
-            self.program = Program(step, name=name, copies=copies)
+            self.program = Program(step_of(function), name=name, copies=copies)
         self._plans: dict[Any, Plan] = {}
         self.at_once: dict[Any, Callable[[Tensor], Tensor]] = {}
 

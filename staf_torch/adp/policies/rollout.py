@@ -234,23 +234,27 @@ class RolloutPolicy(nn.Module):
         return each(whole, x, dim=x.dim() - 2) if x.dim() > 1 else whole(x)
 
 
+def _rolled(policy: RolloutPolicy, _: str = "") -> Callable[[Tensor, Tensor], Tensor]:
+    """The cost of a rollout from the center in a direction u: (B, n), (B, n) -> (B,)."""
+    centers = policy.basis.centers
+    return lambda x, u: policy.rollout(x + centers.radius(x)[..., None] * u)
+
+
+def _improved(policy: RolloutPolicy, _: str = "") -> Callable[[Tensor, Tensor], Tensor]:
+    """The control from the costs at all centers: (B, n), (B, M) -> (B, m)."""
+    return lambda x, values: policy.cost.policy(
+        policy.model.effectiveness(x), fitted_slope(policy.basis, x, values)
+    )
+
+
 class _TwoPrograms:
     """`RolloutPolicy.control`, a center in every lane, then a state in every lane: (..., n) -> (B, 1, m)."""
 
     def __init__(self, policy: RolloutPolicy) -> None:
         centers = policy.basis.centers
         self._directions = centers.directions.detach()
-        self._roll = Rows(
-            lambda x, u: policy.rollout(x + centers.radius(x)[..., None] * u), _NAME, policy, "rollout"
-        )
-        self._improve = Rows(
-            lambda x, values: policy.cost.policy(
-                policy.model.effectiveness(x), fitted_slope(policy.basis, x, values)
-            ),
-            _NAME,
-            policy,
-            "improvement",
-        )
+        self._roll = Rows(_rolled(policy), _NAME, policy, "rollout", make=_rolled)
+        self._improve = Rows(_improved(policy), _NAME, policy, "improvement", make=_improved)
 
         self._one: dict[Any, tuple[Tensor, Plan, Plan]] = {}  # calls with one state
         self.at_once: dict[Any, Callable[[Tensor], Tensor]] = {}  # those that are two calls of machine code
