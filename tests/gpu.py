@@ -16,9 +16,7 @@ import itertools
 import multiprocessing
 import os
 import statistics
-import subprocess
 import sys
-import tempfile
 import time
 import traceback
 import warnings
@@ -32,13 +30,13 @@ from torch import Tensor
 
 from staf_torch import lanes
 from tests import gpu_cases as cases
+from tests.registers import ptxas
 
 FEW, BUILT = 16, 32
 CLOSE, ROUNDED, POSED = 1e-12, 4.0, 1e-3
 """What a float64 number may be off by; and by how many times what plain torch's of float32 is,
 which is at most that much."""
 DTYPES = torch.float64, torch.float32
-ARCHITECTURES = (80, 90, 100)
 Make = Callable[[int, torch.dtype], cases.Case]
 KINDS: dict[str, tuple[Make, tuple[int, ...]]] = {
     "M = 3 SteepestDescent, 100": (cases.weights(3, "SteepestDescent", 100), (100_000, 1_000_000)),
@@ -418,29 +416,6 @@ def registers(only: str) -> int:
                 )
                 print(f"{name:28} {str(dtype)[6:]:8} {told}", flush=True)
     return bad
-
-
-def ptxas(text: str, architectures: tuple[int, ...] = ARCHITECTURES) -> dict[int, tuple[int, int, int]]:
-    """Registers, bytes spilled and bytes of stack of a kernel, by nvcc and ptxas."""
-    found = {}
-    with tempfile.TemporaryDirectory() as folder:
-        source, middle = Path(folder) / "kernel.cu", Path(folder) / "kernel.ptx"
-        source.write_text(text)
-        command = ["nvcc", "-ptx", f"-arch=compute_{min(architectures)}", "--fmad=false"]
-        subprocess.run([*command, "-w", "-o", middle, source], check=True)
-        for each in architectures:
-            out = Path(folder) / "kernel.cubin"
-            given = ["ptxas", "-v", f"-arch=sm_{each}", "-o", out, middle]
-            told = subprocess.run(given, check=True, capture_output=True, text=True).stderr
-            numbers = [line.split() for line in told.splitlines()]
-            used = next(int(line[line.index("Used") + 1]) for line in numbers if "Used" in line)
-            frames = [line for line in numbers if "spill" in line]
-            found[each] = (
-                used,
-                sum(int(line[line.index("spill") - 2]) for line in frames),
-                sum(int(line[0]) for line in frames),
-            )
-    return found
 
 
 def main() -> int:

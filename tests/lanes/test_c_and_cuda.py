@@ -12,9 +12,10 @@ from typing import Any
 import pytest
 import torch
 from recorded import Record
+from registers import ptxas
 from torch import Tensor
 
-from staf_torch import StaFBasis, adp, centers, kernels, lanes, optim, systems, targets
+from staf_torch import StaFBasis, adp, centers, chase_weights, kernels, lanes, optim, systems, targets
 from staf_torch.adp.loop.step import ClosedLoop
 from staf_torch.metrics.ball_error import StateErrorPass
 from staf_torch.optim.objective import NativeError, Precomputed
@@ -171,6 +172,45 @@ def test_a_kernel_on_the_host_is_the_definition(dtype: torch.dtype, bound: float
         for one, other in zip((*end.values(), *out), (*wanted.values(), *outs), strict=True):
             assert one.dtype == other.dtype
             torch.testing.assert_close(one, other, rtol=bound, atol=bound)
+
+
+def test_a_chase_that_is_made_again_is_one_kernel() -> None:
+    """Nothing is computed around it and nothing is read from the device; what has changed is noticed."""
+    basis = StaFBasis(kernels.ExponentialKernel(), centers.StateFollowingCenters(DIRECTIONS, 0.3))
+    states = 0.3 * torch.randn(5, 20, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+
+    law, paper = optim.Nesterov(), targets.Paper()
+
+    def again(states: Tensor, history: bool = True) -> Tensor:
+        return chase_weights(states, basis, paper, law, history=history).weights
+
+    def defined(states: Tensor) -> Tensor:
+        with lanes.compiling("never"):
+            return again(states)
+
+    with lanes.device.recorded() as texts, lanes.compiling("always"):
+        for _ in range(3):
+            again(states)
+            again(states, False)
+        with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as seen:
+            found = again(states)
+        assert {each.key for each in seen.key_averages() if each.key.startswith("aten::")} == {
+            "aten::empty_strided"
+        }
+        torch.testing.assert_close(found, defined(states), rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(again(states, False), found[:, -1:], rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(again(-states), defined(-states), rtol=1e-12, atol=1e-12)
+        basis.centers.directions.mul_(0.5)
+        torch.testing.assert_close(again(states), defined(states), rtol=1e-12, atol=1e-12)
+    assert len(texts) == 1
+
+
+@pytest.mark.skipif(shutil.which("nvcc") is None, reason="no compiler of CUDA")
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_kernels_compile_and_keep_their_numbers_in_registers(dtype: torch.dtype) -> None:
+    for used, spilled, _ in ptxas(lanes.Program(flow).cuda_source(*given(2, dtype))).values():
+        assert 0 < used < 255
+        assert spilled == 0
 
 
 # No step reads a tensor back to the host: on the meta device, which has no numbers, that would raise.

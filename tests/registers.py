@@ -1,0 +1,32 @@
+"""Registers of a kernel and what of it is spilled, by NVIDIA's compilers, without a card."""
+
+from __future__ import annotations
+
+import subprocess
+import tempfile
+from pathlib import Path
+
+ARCHITECTURES = (80, 90, 100)
+
+
+def ptxas(text: str, architectures: tuple[int, ...] = ARCHITECTURES) -> dict[int, tuple[int, int, int]]:
+    """Registers, bytes spilled and bytes of stack of a kernel, by nvcc and ptxas."""
+    found = {}
+    with tempfile.TemporaryDirectory() as folder:
+        source, middle = Path(folder) / "kernel.cu", Path(folder) / "kernel.ptx"
+        source.write_text(text)
+        command = ["nvcc", "-ptx", f"-arch=compute_{min(architectures)}", "--fmad=false"]
+        subprocess.run([*command, "-w", "-o", middle, source], check=True)
+        for each in architectures:
+            out = Path(folder) / "kernel.cubin"
+            given = ["ptxas", "-v", f"-arch=sm_{each}", "-o", out, middle]
+            told = subprocess.run(given, check=True, capture_output=True, text=True).stderr
+            numbers = [line.split() for line in told.splitlines()]
+            used = next(int(line[line.index("Used") + 1]) for line in numbers if "Used" in line)
+            frames = [line for line in numbers if "spill" in line]
+            found[each] = (
+                used,
+                sum(int(line[line.index("spill") - 2]) for line in frames),
+                sum(int(line[0]) for line in frames),
+            )
+    return found
