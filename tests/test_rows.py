@@ -230,25 +230,43 @@ def test_a_riccati_equation_without_a_solution_is_named_by_its_row() -> None:
             adp.LQR(plant, adp.QuadraticCost(1.0, 1.0, 2, 1), period=period)
 
 
-@pytest.mark.parametrize("rows", [1, 2, 7])
-def test_plans_of_rows_are_those_of_single_problems_to_the_bit(rows: int, either: str) -> None:
-    if either == "never" and rows == 7:
-        return
+@pytest.mark.parametrize(("rows", "compile"), [(1, False), (7, False), (2, True)])
+def test_plans_of_rows_are_those_of_single_problems_to_the_bit(rows: int, compile: bool) -> None:
     many, alone = problems(rows)
-    x0 = starts(rows)
-    search = adp.BoxDDP(adp.SampledProblem.of(*many, dt=0.1), steps=5, compile=either == "always")
+    x0, last = starts(rows), rows - 1
+    search = adp.BoxDDP(adp.SampledProblem.of(*many, dt=0.1), steps=4, compile=compile)
     found = search.solve(x0)
-    for row, each in enumerate(alone):
-        one = adp.BoxDDP(adp.SampledProblem.of(*each, dt=0.1), steps=5, compile=either == "always")
-        for got, want in zip(found, one.solve(x0[row : row + 1]), strict=True):
-            assert torch.equal(got[row], want[0])
-    x0[-1] = torch.nan
-    beside = search.solve(x0).control
-    torch.testing.assert_close(beside[:-1], found.control[:-1], rtol=0, atol=0)
-    torch.testing.assert_close(search.solve(found.state[:, 0].float()).control, found.control.float())
-    if rows > 1:
-        with pytest.raises(ValueError, match=rf"a batch of {rows + 1} rows met numbers of .* for {rows}"):
-            search.solve(starts(rows + 1))
+    one = adp.BoxDDP(adp.SampledProblem.of(*alone[last], dt=0.1), steps=4, compile=compile)
+    for got, want in zip(found, one.solve(x0[last:]), strict=True):
+        assert torch.equal(got[last], want[0])
+    assert search.solve(x0.float()).control.dtype == torch.float32
+    x0[0] = torch.nan
+    assert torch.equal(search.solve(x0).control[1:], found.control[1:])
+    with pytest.raises(ValueError, match=rf"a batch of {rows + 1} rows met numbers of .* for {rows}"):
+        search.solve(starts(rows + 1))
+
+
+@pytest.mark.parametrize("rows", [1, 7])
+def test_rollouts_of_rows_are_those_of_single_plants_to_the_bit(rows: int, either: str) -> None:
+    many, alone = problems(rows)
+    x0, policy, last = starts(rows), adp.RolloutPolicy.of_lqr(*many), rows - 1
+    found, one = policy(x0), adp.RolloutPolicy.of_lqr(*alone[last])
+    assert torch.equal(found[last:], one(x0[last:]))
+    torch.testing.assert_close(policy.value(x0)[last:], one.value(x0[last:]))
+    x0[0] = torch.nan
+    assert torch.equal(policy(x0)[1:], found[1:])
+    with pytest.raises(ValueError, match=rf"a batch of {rows + 1} rows met numbers of .* for {rows}"):
+        policy(starts(rows + 1))
+
+
+def test_a_plan_of_rows_is_followed_in_a_loop() -> None:
+    many, alone = problems(2)
+    x0, settings = starts(2), {"steps": 3, "iterations": 1, "compile": False}
+    loop = adp.RecedingHorizon(adp.SampledProblem.of(*many, dt=0.1), **settings)
+    found = adp.simulate(loop, *many, x0, dt=0.1, steps=2, compile=False).state
+    one = adp.RecedingHorizon(adp.SampledProblem.of(*alone[1], dt=0.1), **settings)
+    wanted = adp.simulate(one, *alone[1], x0[1:], dt=0.1, steps=2, compile=False).state
+    assert torch.equal(found[1:], wanted)
 
 
 def test_what_does_not_serve_rows_yet_says_so() -> None:
@@ -256,7 +274,6 @@ def test_what_does_not_serve_rows_yet_says_so() -> None:
     for make in (
         lambda: adp.near_optimal(plant, cost, dt=0.1),
         lambda: adp.DirectShooting(plant, cost, horizon=1.0),
-        lambda: adp.RolloutPolicy.of_lqr(plant, cost),
     ):
         with pytest.raises(ValueError, match="must have no numbers of a row's own"):
             make()

@@ -227,8 +227,14 @@ def points_of_rows(count: int, points: int) -> Iterator[None]:
     if not RowNumbers.made:
         yield
         return
-    with some_rows(torch.arange(count, device="cpu").repeat_interleave(points)):
-        yield
+    before = getattr(_active, "whole", None)
+    if getattr(_active, "chosen", None) is None:
+        _active.whole = count
+    try:
+        with some_rows(torch.arange(count, device="cpu").repeat_interleave(points)):
+            yield
+    finally:
+        _active.whole = before
 
 
 def columns(numbers: Sequence[RowNumbers], count: int | None) -> list[Tensor]:
@@ -238,6 +244,10 @@ def columns(numbers: Sequence[RowNumbers], count: int | None) -> list[Tensor]:
         ValueError: if the batch has another number of rows.
     """
     chosen = getattr(_active, "chosen", None)
+    whole = None if chosen is None else getattr(_active, "whole", None)
+    for each in numbers if whole is not None else ():
+        if len(each.full) != whole:
+            raise _other_count(each.full, whole)
     found = [each.full if chosen is None else each.full[chosen] for each in numbers]
     for each, column in zip(numbers, found, strict=True):
         if count is not None and len(column) != count:
@@ -386,6 +396,7 @@ def _mapped(function: Callable[..., Some], given: tuple[Tree, ...], met: RowNumb
     own = [leaf for leaf in leaves if not isinstance(leaf, Shared)]
     count = len(own[0]) if own else len(columns([met], None)[0])
     columns([met], count)
+    column = column_of(count)  # whatever rows the function chooses
     indices, shape = torch.arange(count, device=met.device), None
 
     def one(index: Tensor, *parts: Tensor) -> tuple[Tensor, ...]:
@@ -396,7 +407,7 @@ def _mapped(function: Callable[..., Some], given: tuple[Tree, ...], met: RowNumb
 
         def resolve(numbers: RowNumbers) -> Tensor:
             if id(numbers) not in known:
-                known[id(numbers)] = columns([numbers], count)[0][index]
+                known[id(numbers)] = column(numbers)[index]
             return known[id(numbers)]
 
         with resolving(resolve):
@@ -405,21 +416,25 @@ def _mapped(function: Callable[..., Some], given: tuple[Tree, ...], met: RowNumb
 
     try:
         found = torch.func.vmap(one, randomness="different")(indices, *own)
-    except RuntimeError as error:
+    except (RuntimeError, ValueError) as error:
         if not _decides(error):
             raise
-        each = [one(index, *(leaf[int(index)] for leaf in own)) for index in indices]
+        each = []
+        for index in indices:
+            with some_rows(index.view(1)):  # of compiled calls inside
+                each.append(one(index, *(leaf[int(index)] for leaf in own)))
         found = tuple(torch.stack(column) for column in zip(*each, strict=True))
     some: Some = unflatten(shape, iter(found))
     return some
 
 
-def _decides(error: RuntimeError) -> bool:
+def _decides(error: Exception) -> bool:
     """Return whether a function read a value under `vmap`, which its rows alone may do."""
     text = str(error)
     if "storage of BatchedTensorImpl" in text or "data pointer of Tensor that doesn't have storage" in text:
         return True  # a Python number or an array of NumPy is wanted
-    return "vmap" in text and ("data-dependent" in text or ".item()" in text or "dynamic shape" in text)
+    signs = ("data-dependent", ".item()", "dynamic shape", "has no part in it")
+    return "vmap" in text and any(sign in text for sign in signs)
 
 
 def _operation(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -16,9 +16,11 @@ from ...kernels import ExponentialKernel, GaussianKernel, Kernel
 from ...lanes import call, compiled, each, repeat
 from ...lanes.call import PlannedCall
 from ...lanes.compiled_methods import Rows, check_states
+from ...lanes.contents import Contents
 from ...lanes.one_thread import small
 from ...lanes.prepared import Plan
-from ...lanes.row_objects import refuse_rows
+from ...lanes.row_numbers import RowNumbers, each_row, points_of_rows
+from ...lanes.row_objects import Rowwise
 from ...numerics.checks import fail, integer, positive_real, trailing
 from ...numerics.default_device import beside, device_of
 from ...numerics.exponential_step import stalls
@@ -34,9 +36,10 @@ _log = logging.getLogger(__name__)
 _STEPS, _MOST = 10, 4096  # over the horizon: usually, and at most
 _ERROR, _WRONG, _LEAST = 1e-2, 3e-2, 1e-12  # of costs: more steps are tried, a warning, next to nothing
 _SAMPLES = 16
+_ROWS = 8  # with numbers of their own, that are looked at
 
 
-class RolloutPolicy(nn.Module):
+class RolloutPolicy(nn.Module, metaclass=Rowwise):
     """u(x) = policy(grad V^(x)) with V^ fitted to the cost of a base policy at the moving centers:
 
         V_i = int_0^horizon (x'Qx + U(u_base)) dt + V_T(x(horizon)),  x(0) = c_i(x),
@@ -78,6 +81,8 @@ class RolloutPolicy(nn.Module):
     with Rosenfeld et al., eq. (5), for the fit.
     """
 
+    rowwise: ClassVar = dict.fromkeys(("control", "gradient", "value", "rollout"), (1,))
+
     @beside
     @small
     def __init__(
@@ -100,7 +105,6 @@ class RolloutPolicy(nn.Module):
             )
         if model.dim != basis.dim:
             raise fail("RolloutPolicy", "basis", f"must have the plant's {model.dim} states", basis.dim)
-        refuse_rows("RolloutPolicy", model=model, cost=cost)
         check_problem(model, cost)
         self.basis, self.model, self.cost, self.terminal = basis, model, cost.around(model), terminal
         check_policy("RolloutPolicy", "base", self.cost, base)
@@ -163,7 +167,18 @@ class RolloutPolicy(nn.Module):
 
     @torch.no_grad()
     def _check_steps(self, chosen: bool) -> None:
-        """Find out by step doubling whether the steps are enough, and take more where they may be chosen."""
+        """Find out by step doubling whether the steps are enough, and take more where they may be chosen; of
+        rows with numbers of their own as many as one of some of them needs."""
+        self.steps, error = max(each_row(lambda: self._enough(chosen), _ROWS))
+        if error > _WRONG:
+            _log.warning(
+                "RolloutPolicy: with %d integration steps over the horizon of %.3g s the costs of the base "
+                "are wrong by %.2g; they need more `steps`, or a shorter horizon.",
+                *(self.steps, self.horizon, error),
+            )
+
+    def _enough(self, chosen: bool) -> tuple[int, float]:
+        """Return the steps that are enough, or those that somebody chose, and the relative error of costs."""
         rest = (
             torch.zeros(self.basis.dim, dtype=torch.float64, device=device_of(self))
             if self.cost.target is None
@@ -174,24 +189,15 @@ class RolloutPolicy(nn.Module):
             2 * torch.rand(_SAMPLES, self.basis.dim, dtype=torch.float64, generator=generator, device="cpu")
             - 1
         )
-        x, error = rest.double() + self.model.spread * away.to(rest.device), math.inf
-        now, first = self.rollout(x), self.steps
+        x, error, steps = rest.double() + self.model.spread * away.to(rest.device), math.inf, self.steps
+        now = self.rollout(x, steps)
         while True:
-            self.steps *= 2
-            finer = self.rollout(x)
+            finer = self.rollout(x, 2 * steps)
             errors = ((now - finer).abs() / (finer.abs() + _LEAST)).nan_to_num(math.inf, math.inf)
             last, error = error, float(errors.quantile(0.8, interpolation="lower"))
-            enough = error <= _ERROR or stalls(error, last) or not chosen or 2 * self.steps > _MOST
-            if enough:
-                break
-            now = finer
-        self.steps = self.steps // 2 if chosen else first
-        if error > _WRONG:
-            _log.warning(
-                "RolloutPolicy: with %d integration steps over the horizon of %.3g s the costs of the base "
-                "are wrong by %.2g; they need more `steps`, or a shorter horizon.",
-                *(self.steps, self.horizon, error),
-            )
+            if error <= _ERROR or stalls(error, last) or not chosen or 4 * steps > _MOST:
+                return steps, error
+            now, steps = finer, 2 * steps
 
     @compiled(_NAME, by=lambda policy: _TwoPrograms(policy))
     def forward(self, x: Tensor) -> Tensor:  # type: ignore[override]
@@ -213,10 +219,16 @@ class RolloutPolicy(nn.Module):
         coefficients = space.fit(self.rollout(self.basis.centers(x)))
         return space.evaluate(torch.zeros_like(x).unsqueeze(-2), coefficients).squeeze(-1)
 
-    def rollout(self, x: Tensor) -> Tensor:
-        """Cost of the base policy over the horizon, and the terminal value: (..., n) -> (...)."""
+    def rollout(self, x: Tensor, steps: int | None = None) -> Tensor:
+        """Cost of the base policy over the horizon, and the terminal value: (..., n) -> (...).
+
+        Args:
+            x: (..., n).
+            steps: integration steps; None for those of the policy.
+        """
         trailing("RolloutPolicy.rollout", "x", x, 1, self.basis.dim)
-        length = self.horizon / self.steps
+        count = self.steps if steps is None else steps
+        length = self.horizon / count
 
         def field(x: Tensor) -> tuple[Tensor, Tensor]:
             u = self.base(x)
@@ -227,7 +239,7 @@ class RolloutPolicy(nn.Module):
             return after, now[1] + paid
 
         def whole(x: Tensor) -> Tensor:
-            x, spent = repeat(self.steps, step, (x, torch.zeros_like(x[..., 0])))
+            x, spent = repeat(count, step, (x, torch.zeros_like(x[..., 0])))
             total: Tensor = spent + self.terminal(x)
             return total
 
@@ -256,6 +268,7 @@ class _TwoPrograms:
         self._roll = Rows(_rolled(policy), _NAME, policy, "rollout", make=_rolled)
         self._improve = Rows(_improved(policy), _NAME, policy, "improvement", make=_improved)
 
+        self._of_rows = any(isinstance(tensor, RowNumbers) for tensor in Contents(policy).tensors)
         self._one: dict[Any, tuple[Tensor, Plan, Plan]] = {}  # calls with one state
         self.at_once: dict[Any, Callable[[Tensor], Tensor]] = {}  # those that are two calls of machine code
 
@@ -274,10 +287,12 @@ class _TwoPrograms:
         rows = x if x.dim() == 2 else x.unsqueeze(0)
         (batch, dim), u = rows.shape, self._directions.to(x)
         count = len(u)
-        if batch > 1:
+        if batch > 1 or self._of_rows:
             at = rows.unsqueeze(1).expand(batch, count, dim).reshape(-1, dim)
             u = u.expand(batch, count, dim).reshape(-1, dim)
-            return self._improve(rows, self._roll(at, u).view(batch, count))
+            with points_of_rows(batch, count):
+                values = self._roll(at, u)
+            return self._improve(rows, values.view(batch, count))
         first, values = self._roll.planned(rows.expand(count, dim), u)
         second, found = self._improve.planned(rows, values.view(1, count))
         if first is not None and second is not None:
