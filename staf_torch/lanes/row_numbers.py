@@ -244,9 +244,9 @@ def columns(numbers: Sequence[RowNumbers], count: int | None) -> list[Tensor]:
         ValueError: if the batch has another number of rows.
     """
     chosen = getattr(_active, "chosen", None)
-    whole = None if chosen is None else getattr(_active, "whole", None)
-    for each in numbers if whole is not None else ():
-        if len(each.full) != whole:
+    whole: int | None = None if chosen is None else getattr(_active, "whole", None)
+    for each in numbers:
+        if whole is not None and len(each.full) != whole:
             raise _other_count(each.full, whole)
     found = [each.full if chosen is None else each.full[chosen] for each in numbers]
     for each, column in zip(numbers, found, strict=True):

@@ -112,10 +112,11 @@ def made_by_rows(make: Callable[[], Some]) -> Some:
     if len(parts) == 1 and parts[0].together:
         return parts[0].found  # type: ignore[no-any-return]
     objects, rows = [part.found for part in parts], [part.rows for part in parts]
-    made = merged(objects, rows)
+    made: Some = merged(objects, rows)
     if any(isinstance(tensor, RowNumbers) for tensor in Contents(made).tensors):
         return made
-    return merged(objects, rows, beside(make))  # as many rows as there are, although all are alike
+    made = merged(objects, rows, beside(make))  # as many rows as there are, although all are alike
+    return made
 
 
 class Note(str):

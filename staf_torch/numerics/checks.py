@@ -171,11 +171,10 @@ def one_or_each(call: str, name: str, value: Any, count: int) -> Tensor:
     """Return a finite number for each of ``count``, given as one for all or one each: (count,) float64."""
     if isinstance(value, Tensor):
         refuse_gradient(call, **{name: value})
-        given = number(call, name, value)
-        assert isinstance(given, Tensor)
-        if given.dim() > 1 or (given.dim() and len(given) != count):
+        number(call, name, value)
+        if value.dim() > 1 or (value.dim() and len(value) != count):
             raise fail(call, name, f"must be one number or a list of {count}", value)
-        return given.detach().to("cpu", torch.float64).expand(count).clone()
+        return value.detach().to("cpu", torch.float64).expand(count).clone()
     given = value if isinstance(value, Sequence) else [real(call, name, value)] * count
     numbers = vector(call, name, given)
     if len(numbers) != count:
