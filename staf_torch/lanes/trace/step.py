@@ -135,6 +135,8 @@ def trace(step: Step, given: Given, *, widened: bool = False, folded: bool = Fal
         ]:
             raise NotLoweredError(_other_carry("the step returns", ends, carry))
         leaves, shape = flatten(out)
+        if any(isinstance(leaf, RowNumbers) for leaf in (*ends, *leaves)):
+            raise NotLoweredError("it reads numbers of a row's own in another thread, which knows no row")
         if any(leaf.dim() == 0 or leaf.shape[0] != 1 for leaf in leaves):
             raise NotLoweredError("an output of the step has no dimension of rows")
         following = [node for end in ends for node in tracer.nodes(end).ravel().tolist()]
