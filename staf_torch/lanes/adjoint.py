@@ -39,8 +39,12 @@ def gradient_memory(mebibytes: float) -> Iterator[None]:
     What does not fit is computed again by the backward pass, at one or two more forward passes.
 
     Example:
+        >>> x0 = torch.ones(2, dtype=torch.float64, requires_grad=True)
+        >>> program = lanes.Program(lambda x, now, row: (0.5 * x, x))
         >>> with lanes.gradient_memory(64):
-        ...     loss(program).backward()
+        ...     program(x0, steps=3)[1].sum().backward()
+        >>> x0.grad
+        tensor([1.7500, 1.7500], dtype=torch.float64)
 
         Shown by `staf_torch/lanes/GRADIENTS.md`.
 
