@@ -24,7 +24,8 @@ import time
 from collections.abc import Callable, Iterable
 from typing import Any, ParamSpec, TypeVar
 
-_P, _R = ParamSpec("_P"), TypeVar("_R")
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
 _log = logging.getLogger(__name__)
 FIRST, EVERY = 1.5, 10.0
 """s before anything is shown, and from a line to the next."""

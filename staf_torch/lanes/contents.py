@@ -21,7 +21,7 @@ import operator
 import pickle
 import sys
 import sysconfig
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import chain
 from operator import is_
 from pathlib import Path
@@ -131,7 +131,7 @@ class Contents:
         self._structural = [(tensor, tensor._version) for tensor in walk.others if not tensor.is_inference()]
         self._versions = [tensor._version for tensor in self._changeable]
         inference = [tensor for tensor in found if tensor.is_inference()]
-        self._rare = [
+        self._rare: list[tuple[Callable[[Any], Any], Any, Any]] = [
             *((version, tensor, version(tensor)) for tensor in inference),
             *((set, part, set(part)) for part in walk.sets),
             *((_ARRAY, array, array.tobytes()) for array in walk.arrays),
@@ -320,7 +320,8 @@ class Walk(pickle.Pickler):
 
     def reducer_override(self, value: Any) -> Any:
         if isinstance(value, nn.Module):
-            if _is_layer(type(value)):
+            kind: Any = type(value)  # which has a hash
+            if _is_layer(kind):
                 self.layers.update(map(id, value._parameters.values()))
             state = {k: v for k, v in value.__getstate__().items() if k not in IDLE and k != BOUND}
             # The keys of hooks count all hooks of the process.

@@ -11,7 +11,8 @@ from typing import Any, ParamSpec, TypeVar
 
 import torch
 
-_P, _R = ParamSpec("_P"), TypeVar("_R")
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
 ENTRIES = 512
 """Entries that a row of a program is taken to have, the most in an operation."""
 _GRAIN = 32768  # entries from which torch itself takes a second thread for an operation entry by entry

@@ -311,6 +311,9 @@ def kept(module: nn.Module, name: str, *, zero: bool = False, squared: bool = Fa
     Raises:
         ValueError: if a learned one is not positive (with ``zero``: is negative), or not finite.
     """
+    fixed = module._buffers.get(name)
+    if fixed is not None and not fixed.requires_grad:
+        return fixed
     value: Tensor = getattr(module, name)
     if not (value.requires_grad or name in module._parameters) or value.is_meta:
         return value

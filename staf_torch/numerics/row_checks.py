@@ -145,7 +145,7 @@ def check_radius(radius: Callable[[Tensor], Any], directions: Tensor) -> None:
         check_rows(name, of_rows, [x], sizes=directions.shape)
         with torch.no_grad():
             found = [of_rows(x.repeat(count, 1))[0] for count in row_counts(directions.shape)]
-        if not torch.allclose(*found, rtol=1e-6, equal_nan=True):
+        if not torch.allclose(found[0], found[1], rtol=1e-6, equal_nan=True):
             raise ValueError(f"`{name}` must map each state by itself; nu depends on how many there are.")
 
     once(radius, ("radius", directions.shape), check)
@@ -166,7 +166,10 @@ def check_kernel(kernel: Any, directions: Tensor) -> None:
         few, many = [size for size in (2, 3, 4) if size != n][:2]
         x, y, c, b = (_somewhere(directions, *shape) for shape in ((n,), (few, n), (many, n), (many,)))
         check_rows(f"{name}.forward", kernel, [y, c], (few, many), sizes=directions.shape)
-        forms = {"gradient": ([y, c, b], (few, n)), "core": ([x, y, c], (few, many))}
+        forms: dict[str, tuple[list[Tensor], tuple[int, ...]]] = {
+            "gradient": ([y, c, b], (few, n)),
+            "core": ([x, y, c], (few, many)),
+        }
         forms |= {"log_gain": ([x], ()), "log_scale": ([x, y], (few,))}
         for form, (given, inner) in forms.items():
             method = getattr(kernel, form)

@@ -301,9 +301,9 @@ class _TwoPrograms:
                 self.at_once.clear()
             self._one[key] = u, first, second
             if isinstance(first, PlannedCall) and isinstance(second, PlannedCall):
-                roll, improve = first.of_states(count), second.of_states(*x.shape[:-1])
-                if roll is not None and improve is not None:
-                    self.at_once[key[:3]] = lambda x: improve(x, roll(x, u))
+                values_at, u_of = first.of_states(count), second.of_states(*x.shape[:-1])
+                if values_at is not None and u_of is not None:
+                    self.at_once[key[:3]] = lambda x: u_of(x, values_at(x, u))
         return found
 
 
