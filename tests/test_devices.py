@@ -112,3 +112,19 @@ def test_an_experiment_runs_on_a_device_with_the_numbers_of_the_cpu(name: str, t
         key: None if number is None else pytest.approx(number, rel=1e-6, abs=1e-9)
         for key, number in wanted.items()
     }
+
+
+def test_what_was_made_on_the_cpu_serves_states_that_are_elsewhere() -> None:
+    masses = st.rows(torch.tensor([0.5, 2.0], dtype=torch.float64))
+    plant, cost = systems.Pendulum(mass=masses), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+    policy = adp.LQR(systems.Pendulum(), cost)
+    basis = st.StaFBasis(st.GaussianKernel(), st.StateFollowingCenters(st.rings(6), 0.1))
+
+    def found(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        loop = adp.simulate(policy, plant, cost, x, dt=0.01, steps=2)
+        states = systems.simulate(plant, x, dt=0.01, steps=3)
+        return loop.cost, states, st.chase(states, basis, targets.Paper(), st.optim.Exact()).estimate
+
+    with lanes.compiling("never"):
+        for there_, here in zip(found(there(X0)), found(X0), strict=True):
+            agree(there_, here)

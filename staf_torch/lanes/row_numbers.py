@@ -397,7 +397,8 @@ def _mapped(function: Callable[..., Some], given: tuple[Tree, ...], met: RowNumb
     count = len(own[0]) if own else len(columns([met], None)[0])
     columns([met], count)
     column = column_of(count)  # whatever rows the function chooses
-    indices, shape = torch.arange(count, device=met.device), None
+    where = own[0].device if own else met.device  # numbers of rows follow the points
+    indices, shape = torch.arange(count, device=where), None
 
     def one(index: Tensor, *parts: Tensor) -> tuple[Tensor, ...]:
         nonlocal shape
@@ -407,7 +408,7 @@ def _mapped(function: Callable[..., Some], given: tuple[Tree, ...], met: RowNumb
 
         def resolve(numbers: RowNumbers) -> Tensor:
             if id(numbers) not in known:
-                known[id(numbers)] = column(numbers)[index]
+                known[id(numbers)] = column(numbers).to(where)[index]
             return known[id(numbers)]
 
         with resolving(resolve):

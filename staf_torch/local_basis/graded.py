@@ -261,7 +261,8 @@ class GradedSpace(NamedTuple):
 
     def _unscale(self) -> Tensor:
         """k_j! r^(-2 k_j): (..., M)."""
-        return self.basis.factorial.to(self.nu) * self._r2().unsqueeze(-1) ** -self.basis.degree
+        degree = self.basis.degree.to(self.nu.device)
+        return self.basis.factorial.to(self.nu) * self._r2().unsqueeze(-1) ** -degree
 
 
 def over_points(value: Tensor) -> Tensor:
