@@ -68,7 +68,7 @@ def designed_on_cpu(function: Callable[Given, Found]) -> Callable[Given, Found]:
 def on_cpu(given: Found) -> Found:
     """Return a module or a tensor on the CPU: itself, or a copy of what is on a device."""
     if isinstance(given, Tensor):
-        return given.cpu()
+        return given.cpu()  # type: ignore[return-value]
     if isinstance(given, nn.Module) and not all(each.is_cpu for each in _tensors((given,))):
         return copy.deepcopy(given).cpu()
     return given

@@ -26,11 +26,10 @@ from ...numerics.exponential_step import (
     exponential_stages,
     exponential_step,
     fewest_steps,
-    times,
 )
 from ...numerics.runge_kutta import exponential, stage_weights
 from ...systems import Clocked, Plant, StepPlant
-from .cost import Cost
+from .cost import Cost, quadratic
 from .held_linear import periods
 
 _log = logging.getLogger(__name__)
@@ -247,7 +246,7 @@ class Holding:
             if cost is None or still:
                 return plant.motion(at, u), none
             assert self.curvature is not None
-            return plant.motion(at, u), cost.state_rate(at) - _square(self.curvature.to(x), begun + away)
+            return plant.motion(at, u), cost.state_rate(at) - quadratic(self.curvature.to(x), begun + away)
 
         moved, rests, rates = exponential_stages(table, field, x)
         paid = none
@@ -259,7 +258,7 @@ class Holding:
                 paid = paid + (shares.reshape(-1, *[1] * none.dim()) * rates).sum(0)
             assert table.paid is not None
             seen = torch.cat((begun, rests[0], 0.5 * (rests[1] + rests[2]), rests[3]), dim=-1)
-            paid = paid + _square(table.paid.to(x), seen)
+            paid = paid + quadratic(table.paid.to(x), seen)
         after = plant.displaced(x, moved)
         return (after, paid, h * (rests[2] - rests[1]).abs().amax(-1)) if watch else (after, paid)
 
@@ -396,10 +395,8 @@ class Holding:
             pushed = plant.motion(x, u + one) - rate
             push = float(pushed.abs().amax(-1).nan_to_num(0.0, 0.0).quantile(0.5))
             width = _MOVED * plant.spread / (self.dt * push) if push > 0 else 1.0
-            least, most = (
-                max(float(low[k]), float(still[k]) - width),
-                min(float(high[k]), float(still[k]) + width),
-            )
+            least = max(float(low[k]), float(still[k]) - width)
+            most = min(float(high[k]), float(still[k]) + width)
             columns.append(least + (most - least) * chance[:, k])
         u = torch.stack(columns, dim=-1) if columns else u
         moves = torch.isfinite(plant.motion(x, u)).all(-1)
@@ -417,10 +414,6 @@ def _quadratic(cost: Cost) -> bool:
     kind = type(cost)
     own = kind.state_rate is not Cost.state_rate or kind.deviation is not Cost.deviation
     return not (own or cost.output is not None or cost.periodic)
-
-
-def _square(matrix: Tensor, x: Tensor) -> Tensor:
-    return (times(matrix, x) * x).sum(-1)
 
 
 def runge_kutta_loop(

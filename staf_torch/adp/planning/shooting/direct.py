@@ -32,7 +32,7 @@ from ...problem.rules import (
 from ...problem.shapes import check_policy, check_problem, check_value
 from ..trajectories import Trajectories, chosen
 from .merging import ROWS, cheapest, joined, merged, selected
-from .mesh import graded, halved, split
+from .mesh import graded, halved, rates_of, split
 from .newton import Interval, MeshPlan, NewtonSolution, follow, minimise, replay, why_none
 from .optimum import Optimum
 from .plan_search import PlanSearch
@@ -153,7 +153,7 @@ class DirectShooting:
         self.lqr: LQR | None = None
         if base is None or terminal is None or horizon is None or intervals is None:
             self.lqr = self._regulator(horizon, terminal is None and cost.ending is None)
-            rates = rates if self.lqr is None else _rates(system, self.lqr)
+            rates = rates if self.lqr is None else rates_of(system, self.lqr)
         given = () if base is None else tuple(base) if isinstance(base, Sequence) else (base,)
         if not given or (len(given) > 1 and self.lqr is not None):
             given = (*given, self._resting if self.lqr is None else self.lqr)
@@ -246,8 +246,8 @@ class DirectShooting:
         """
         trailing("DirectShooting.solve", "x0", x0, dims=2, last=self.stage.system.dim, meta=False, vmap=False)
         if not x0.is_cpu:
-            there = None if warm is None else _placed(warm, torch.device("cpu"))
-            return _placed(self.solve(x0.cpu(), warm=there), x0.device)
+            there = None if warm is None else warm.to(torch.device("cpu"))
+            return self.solve(x0.cpu(), warm=there).to(x0.device)
         parts = list[Optimum]()
         with Sign("", len(x0), "states") as sign:
             for k, rows in enumerate(x0.split(ROWS)):
@@ -448,14 +448,3 @@ class DirectShooting:
 def _always(policy: Policy) -> Callable[[Tensor, float], Tensor]:
     """A policy as a control u(x, t)."""
     return lambda x, t: policy(x)
-
-
-def _rates(system: Plant, lqr: LQR) -> tuple[float, float]:
-    """The slowest decay and the fastest rate of the LQR's modes, 1/s."""
-    a, b = system.linearisation(lqr.cost.target, lqr.cost.target_input)
-    modes = torch.linalg.eigvals(a.to(lqr.p) - b.to(lqr.p) @ lqr.k)
-    return float(-modes.real.max()), float(modes.abs().max())
-
-
-def _placed(found: Optimum, device: torch.device) -> Optimum:
-    return Optimum(*(each.to(device) if isinstance(each, Tensor) else each for each in found))

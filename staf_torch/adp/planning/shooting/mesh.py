@@ -7,6 +7,8 @@ import math
 import torch
 from torch import Tensor
 
+from ....systems import Plant
+from ...loop.controller import LQR
 from .newton import Interval, MeshPlan
 
 _GRADING = 6.0  # ratio of a mesh's last interval to the first
@@ -48,3 +50,10 @@ def split(stage: Interval, plan: MeshPlan, feedback: Tensor, lengths: Tensor) ->
     state = torch.cat((state, plan.state[:, -1:]), dim=1)
     control = torch.stack((early, late), dim=2).flatten(1, 2)
     return MeshPlan(state, control, plan.cost), feedback.repeat_interleave(2, dim=1)
+
+
+def rates_of(system: Plant, lqr: LQR) -> tuple[float, float]:
+    """The slowest decay and the fastest rate of the LQR's modes, 1/s."""
+    a, b = system.linearisation(lqr.cost.target, lqr.cost.target_input)
+    modes = torch.linalg.eigvals(a.to(lqr.p) - b.to(lqr.p) @ lqr.k)
+    return float(-modes.real.max()), float(modes.abs().max())

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import torch
 from torch import Tensor
 
 from ....numerics.shown import span
@@ -46,6 +47,13 @@ class Optimum(NamedTuple):
             f"Optimum({rows} states, value {span(self.value)}, {found} converged, {times - 1} intervals over "
             f"{float(self.time[-1]):.4g} s{more})"
         )
+
+    def to(self, device: torch.device) -> Optimum:
+        """The same on a device."""
+        moved: dict[str, Any] = {
+            name: part.to(device) for name, part in self._asdict().items() if name != "reason"
+        }
+        return self._replace(**moved)
 
     def replay(self) -> PlanReplay:
         """A controller that runs the plan of every row, open loop; it holds the mean over each period."""
