@@ -27,16 +27,19 @@ from .tree import Shared, Tree, flatten, unflatten
 Some = TypeVar("Some")
 Resolve = Callable[["RowNumbers"], Tensor]
 _active, _first = threading.local(), threading.Lock()
-_STRUCTURE_NAMES = """dim ndimension size numel nelement is_floating_point is_complex is_signed stride element_size
+_STRUCTURE_NAMES = """dim ndimension size numel nelement is_floating_point is_complex is_signed stride
+    element_size
     __len__ is_contiguous storage_offset get_device type is_pinned is_inference is_conj is_neg"""
 _STRUCTURE = frozenset(_STRUCTURE_NAMES.split())
 """Methods that answer alike for all rows."""
-_ATTRIBUTES_NAMES = """shape dtype device layout ndim itemsize nbytes is_cpu is_cuda is_meta is_sparse is_quantized
+_ATTRIBUTES_NAMES = """shape dtype device layout ndim itemsize nbytes is_cpu is_cuda is_meta is_sparse
+    is_quantized
     is_nested is_mkldnn is_mps is_xpu names _version"""
 _ATTRIBUTES = frozenset(_ATTRIBUTES_NAMES.split())
 _OF_ALL = frozenset(["requires_grad", "grad", "grad_fn", "is_leaf", "retains_grad", "output_nr"])
 """Attributes of the numbers of all rows together."""
-_READS_NAMES = """__bool__ __float__ __int__ __index__ __complex__ __contains__ item tolist numpy __array__ equal
+_READS_NAMES = """__bool__ __float__ __int__ __index__ __complex__ __contains__ item tolist numpy __array__
+    equal
     allclose is_nonzero data_ptr"""
 _READS = frozenset(_READS_NAMES.split())
 
