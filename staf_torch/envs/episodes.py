@@ -15,7 +15,7 @@ from torch import Tensor
 from .. import systems
 from ..adp import Controller, Cost, Feedback, QuadraticCost
 from ..adp.loop.controller import Carried, Policy
-from ..adp.loop.simulation import uniform_numbers
+from ..adp.loop.drawing import points_of_steps
 from ..adp.loop.step import ClosedLoop, LoopState
 from ..adp.problem.shapes import check_problem
 from ..lanes.gradients import refuse_gradient
@@ -235,7 +235,7 @@ class Agent:
         self.dt, self.seed = positive_real("Agent", "dt", dt), seed
         self.state, self.action = state, action
         self._carried: Carried | None = None
-        self._generators: list[torch.Generator] = []
+        self._steps = 0  # since `begin`
 
     def begin(self) -> None:
         """Forget what was learned, and begin the sequence of random numbers anew."""
@@ -250,8 +250,10 @@ class Agent:
         with torch.no_grad():
             if self._carried is None:
                 self._carried = self.controller.init(x)
-                self._generators = [torch.Generator().manual_seed(self.seed + row) for row in range(len(x))]
-            uniform = uniform_numbers(x, 1, self.controller.draws, self._generators)[:, 0]
+                self._steps = 0
+            seeds = range(self.seed, self.seed + len(x))
+            uniform = points_of_steps(x, seeds, self._steps, 1, self.controller.draws)[:, 0]
+            self._steps += 1
             u, self._carried = self.controller.step(x, self._carried, uniform, self.dt)
         control: Numbers = u.reshape(*seen.shape[:-1], -1).numpy()
         return control if self.action is None else self.action(control)

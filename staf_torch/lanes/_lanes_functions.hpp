@@ -210,6 +210,41 @@ LIBM(asinh) LIBM(acosh) LIBM(atanh) LIBM(erfc) LIBM(lgamma)
 LIBM_TWO(atan2) LIBM_TWO(pow) LIBM_TWO(hypot)
 INLINE V copysign(V size, V sign) { return with_sign(abs(size), sign); }
 
+// Philox 4x32-10 (lanes/philox.py): words of 32 bits in lanes of 64. The numbers that come in are whole and small.
+typedef uint64_t Words __attribute__((vector_size(8 * W)));
+typedef int64_t Wholes __attribute__((vector_size(8 * W)));
+INLINE Words word_of(V low, V high) {
+    return (Words)__builtin_convertvector(low, Wholes) | (Words)__builtin_convertvector(high, Wholes) << 16;
+}
+INLINE Words product_of(Words x, Words y) {  // of numbers below 2^32, for which the processor has an instruction
+#if defined(__clang__) || LANES_SINGLE
+    return x * y;
+#elif LANES_512
+    typedef int Ints __attribute__((vector_size(64)));
+    typedef long long Longs __attribute__((vector_size(64)));
+    return (Words)__builtin_ia32_pmuludq512_mask((Ints)x, (Ints)y, Longs{}, -1);
+#elif defined(__AVX2__)
+    typedef int Ints __attribute__((vector_size(32)));
+    return (Words)__builtin_ia32_pmuludq256((Ints)x, (Ints)y);
+#else
+    return x * y;
+#endif
+}
+INLINE V philox(V a, V b, V c, V d, V low, V high, V place, bool second) {
+    const uint64_t word = 0xFFFFFFFF;
+    Words one = word_of(a, b), other = word_of(c, d);
+    Words x = word_of(low, high), y = (Words)__builtin_convertvector(place, Wholes), z = {}, w = {};
+    UNROLLED for (int k = 0; k < 10; ++k) {
+        const Words p = product_of(x, Words{} + 0xD2511F53u), q = product_of(z, Words{} + 0xCD9E8D57u);
+        x = (q >> 32) ^ y ^ one, y = q & word, z = (p >> 32) ^ w ^ other, w = p & word;
+        one = (one + 0x9E3779B9u) & word, other = (other + 0xBB67AE85u) & word;
+    }
+    const Words whole = second ? z << 21 | w >> 11 : x << 21 | y >> 11;
+    return __builtin_convertvector((Wholes)(whole - (Words{} + (uint64_t(1) << 52))), V) * REAL(0x1p-52);
+}
+INLINE V philox_first(V a, V b, V c, V d, V e, V f, V g) { return philox(a, b, c, d, e, f, g, false); }
+INLINE V philox_second(V a, V b, V c, V d, V e, V f, V g) { return philox(a, b, c, d, e, f, g, true); }
+
 // x - q y with q = x / y towards 0. The quotient as it is rounded may be one off, also across a whole number; the
 // rest is exact with one rounding, and so is the step back. Large quotients go to the library's own function.
 #if defined(__AVX512F__) || defined(__FMA__) || defined(__ARM_FEATURE_FMA)

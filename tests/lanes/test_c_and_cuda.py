@@ -17,6 +17,7 @@ from torch import Tensor
 
 from staf_torch import StaFBasis, adp, centers, chase_weights, kernels, lanes, optim, systems, targets
 from staf_torch.adp.loop.step import ClosedLoop
+from staf_torch.lanes import philox
 from staf_torch.metrics.ball_error import StateErrorPass
 from staf_torch.optim.objective import NativeError, Precomputed
 
@@ -78,6 +79,48 @@ def test_c_of_a_step_is_the_definition(dtype: torch.dtype, bound: float, tmp_pat
     torch.testing.assert_close(size, sizes[0], rtol=bound, atol=bound)
     torch.testing.assert_close(state[:2], end["x"][0], rtol=bound, atol=bound)
     assert state[2:].tolist() == [9.0, float(end["above"][0])]
+
+
+@needs_gcc
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_random_numbers_of_a_seed_and_a_step_are_the_same_on_every_back_end(
+    dtype: torch.dtype, tmp_path: Path
+) -> None:
+    def step(time: Tensor, now: Any, seed: Tensor) -> tuple[Tensor, Tensor]:
+        return time + 1, philox.uniform(seed, time, 3)
+
+    seeds = philox.seed_parts([0, 5, 2**41 + 3, 2**64 - 1], torch.empty(0, dtype=dtype))
+    begin = torch.full((4,), 65534.0, dtype=dtype)  # the step's upper half changes
+    program = lanes.Program(step)
+    wanted = program.definition(begin, (), seeds, steps=4)[1]
+    assert program(begin, (), seeds, steps=4)[1].equal(wanted)
+    assert program.compiled
+    assert program(begin[2:3], (), seeds[2:3], steps=4)[1].equal(wanted[2:3])
+    with lanes.device.host():
+        assert program(begin, (), seeds, steps=4)[1].equal(wanted)
+    text = program.c_source("draw", begin, (), seeds)
+    kind = "float" if dtype == torch.float32 else "double"
+    text += "void begin(draw_state *s) { draw_start(s); }\n"
+    text += f"void call(draw_state *s, const {kind} *r, {kind} *u) {{ draw(s, r, u); }}\n"
+    library = built(text, tmp_path, "draw.c", ("gcc", *STRICT))
+    state, found = torch.empty(1, dtype=dtype), torch.empty(4, 3, dtype=dtype)
+    library.begin(pointer(state))
+    for k in range(4):
+        library.call(*map(pointer, (state, seeds[0], found[k])))
+    assert found.equal(wanted[0])
+    many = philox.uniform(seeds, begin, 20_000)
+    assert float(many.abs().max()) <= 1
+    assert abs(float(many.mean())) < 0.01
+    assert abs(float(many.square().mean()) - 1 / 3) < 0.01
+
+
+def test_words_are_the_known_answers_of_random123() -> None:
+    zero, ones = torch.zeros((), dtype=torch.int64), torch.tensor(0xFFFFFFFF)
+    for word, known in (
+        (zero, "6627e8d5 e169c58d bc57ac4c 9b00dbd8"),
+        (ones, "408f276d 41c83b0e a20bc7c6 6d5451fd"),
+    ):
+        assert " ".join(f"{int(one):08x}" for one in philox.words([word] * 4, [word] * 2)) == known
 
 
 @needs_gcc

@@ -83,15 +83,24 @@ class RandomPoints(Extrapolation):
         half_width: as in `Extrapolation`.
         centers: as in `Extrapolation`.
         around: as in `Extrapolation`.
+        random: ``counter``, numbers of the row's seed and the step, or ``generator``, those of a generator a
+            row as before version 0.2, drawn on the CPU ahead of a loop; the latter goes with version 0.3.
 
     Raises:
         ValueError: if an argument breaks its rule.
     """
 
     def __init__(
-        self, count: int, half_width: float | Radius, centers: str = "moving", *, around: str = "state"
+        self,
+        count: int,
+        half_width: float | Radius,
+        centers: str = "moving",
+        *,
+        around: str = "state",
+        random: str = "counter",
     ) -> None:
         super().__init__(half_width, centers, around=around)
+        self.random = choice("RandomPoints", "random", random, ("counter", "generator"))
         self.count = self.draws = integer("RandomPoints", "count", count, least=1)
         self.register_buffer("weights", torch.full((count,), 1 / count, dtype=torch.float64, device="cpu"))
 

@@ -18,6 +18,7 @@ from ...lanes.compiled_methods import undecided, worth
 from ...lanes.gradients import wants_gradient
 from ...lanes.loop_program import LoopProgram
 from ...lanes.opaque import opaque
+from ...lanes.philox import seed_parts
 from ...lanes.plain_time import DIFFERENTIATED
 from ...lanes.row_decisions import decided
 from ...lanes.row_numbers import over_rows, some_rows
@@ -36,6 +37,7 @@ from ..problem.rules import warn_if_restless, warn_if_unstable
 from ..problem.shapes import check_problem
 from .accuracy import hardest, needed, warn_of_errors, warn_of_models
 from .controller import Carried, Controller, Feedback, Policy
+from .drawing import by_generator, generated
 from .picture import LoopAbout, picture, summary
 from .step import ClosedLoop, LoopState, program, record
 
@@ -180,7 +182,8 @@ def simulate(
 ) -> LoopResult:
     """The closed loop of a controller and a plant from the initial states x0.
 
-    Row b draws from its own generator, seeded ``seed + b``: what it does depends on no other row.
+    Random numbers of row b are a function of its seed, ``seed + b``, and of the step (Philox 4x32-10): what it
+    does depends on no other row, and is the same on every device.
 
     Example:
         >>> plant = systems.TwoState()
@@ -397,14 +400,17 @@ def _run(
     state: LoopState = over_rows(loop.init, x0)
     pieces: list[list[Tensor]] = []
     draws, done = loop.controller.draws, 0
-    generators = [torch.Generator().manual_seed(seed) for seed in (seeds if draws else ())]
+    old = bool(draws) and by_generator(loop.controller)
+    row = {"seed": seed_parts(seeds, x0)} if draws and not old else {}
+    generators = [torch.Generator().manual_seed(seed) for seed in (seeds if old else ())]
+    draws = draws if old else 0  # ahead of the loop; others are drawn in it
     ahead = max(1, min(_DRAWN_AHEAD, _NUMBERS // (x0.numel() * max(draws, 1))))
     while done < steps:
         # A piece ends at a recorded time, or there is none inside.
         count = ahead // every * every if every <= ahead else min(ahead, every - done % every)
         count = min(count, steps - done)
-        uniform = uniform_numbers(x0, count, draws, generators)
-        state, out = steps_of(state, uniform, {}, every=min(every, count))
+        uniform = generated(x0, count, draws, generators)
+        state, out = steps_of(state, uniform, row, every=min(every, count))
         if done % every == 0:
             pieces.append(flatten(out)[0])
         done += count
@@ -427,15 +433,6 @@ def _seeds(seed: int | Sequence[int], batch: int) -> Sequence[int]:
         return seeds
     first = integer("simulate", "seed", seed, least=0)
     return range(first, first + batch)
-
-
-def uniform_numbers(x0: Tensor, count: int, draws: int, generators: Sequence[torch.Generator]) -> Tensor:
-    """The next ``count`` steps' uniform numbers of [-1, 1], (B, count, draws, n), one generator a row."""
-    rows, dim = x0.shape
-    drawn = torch.empty(rows, count, draws, dim, dtype=torch.float64, device="cpu")
-    for row, generator in zip(drawn.unbind(0), generators, strict=False):
-        row.uniform_(-1.0, 1.0, generator=generator)
-    return drawn.to(x0)
 
 
 def _check(system: Plant, cost: Cost, x0: Tensor) -> Cost:

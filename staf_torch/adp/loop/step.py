@@ -18,6 +18,7 @@ from ...systems import Plant
 from ..problem.cost import Cost
 from ..problem.held_plant import Holding, Substeps
 from .controller import Carried, Controller, Feedback
+from .drawing import points_of_step
 
 
 class LoopState(NamedTuple):
@@ -166,8 +167,10 @@ def recorded(
         loop: one step.
         state: before the step.
         uniform: its random numbers, (B, draws, n).
-        row: nothing.
+        row: by ``seed`` the parts of each row's seed, (B, 4), by which its numbers are drawn here instead.
     """
+    if "seed" in row:
+        uniform = points_of_step(row["seed"], state.lived, loop.controller.draws, state.x.shape[-1])
     after, u = loop(state, uniform)
     return after, record(loop, state, torch.where(after.alive.unsqueeze(-1), u, torch.nan))
 

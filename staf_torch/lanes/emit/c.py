@@ -24,6 +24,41 @@ class Names(NamedTuple):
     outputs: Sequence[str]
 
 
+def random_numbers(lines: Sequence[str], real: str, qualifiers: str) -> list[str]:
+    """Return the functions of random numbers that statements call: `lanes.philox` in words of 32 bits."""
+    suffix = "f" if real == "float" else ""
+    if not any("philox_" in line for line in lines):
+        return []
+    given = ", ".join(f"{real} {name}" for name in "abcdefg")
+    names = f"philox_first{suffix}", f"philox_second{suffix}"
+    ends = ("x << 21 | y >> 11", "z << 21 | w >> 11")
+    return [
+        line
+        for name, end in zip(names, ends, strict=True)
+        for line in (
+            _PHILOX % {"how": qualifiers, "real": real, "name": name, "given": given, "end": end}
+        ).splitlines()
+    ]
+
+
+_PHILOX = """%(how)s %(real)s %(name)s(%(given)s)
+{
+    unsigned long long one = (unsigned long long)a + ((unsigned long long)b << 16), p, q, whole;
+    unsigned long long other = (unsigned long long)c + ((unsigned long long)d << 16);
+    unsigned long long x = (unsigned long long)e + ((unsigned long long)f << 16), y = (unsigned long long)g;
+    unsigned long long z = 0, w = 0;
+    int k;
+    for (k = 0; k < 10; ++k) {
+        p = x * 0xD2511F53u, q = z * 0xCD9E8D57u;
+        x = (q >> 32) ^ y ^ one, y = q & 0xFFFFFFFFu, z = (p >> 32) ^ w ^ other, w = p & 0xFFFFFFFFu;
+        one = (one + 0x9E3779B9u) & 0xFFFFFFFFu, other = (other + 0xBB67AE85u) & 0xFFFFFFFFu;
+    }
+    whole = %(end)s;
+    return (%(real)s)((long long)whole - (1ll << 52)) * (%(real)s)2.220446049250313e-16;
+}
+"""
+
+
 class ScalarWriter(StatementWriter):
     """What C and CUDA C have in common: every number is a variable of its own."""
 
@@ -182,8 +217,9 @@ def c_text(
     for given, sizes in ((names.nows, layout.nows), (names.rows, layout.rows)):
         arguments += [f"const {real} {n}[{size}]" for n, size in zip(given, sizes, strict=True)]
     arguments += [f"{real} {n}[{size}]" for n, size in zip(names.outputs, layout.outputs, strict=True)]
-    lines += [f"static inline void {name}({', '.join(arguments)})"]
-    lines += writer._function(lambda: writer.body(names, following, outputs))
+    body = writer._function(lambda: writer.body(names, following, outputs))
+    lines += random_numbers(body, real, "static inline")
+    lines += [f"static inline void {name}({', '.join(arguments)})", *body]
     return commented(note) + guarded(name, "\n".join(lines))
 
 

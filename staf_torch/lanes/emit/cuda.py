@@ -16,7 +16,7 @@ import torch
 
 from ..trace.graph import FLAG, NARROW, REAL, ROW, STEP, WHOLE, WIDE, Graph
 from ..trace.tracer import LARGE, NotLoweredError
-from .c import Names, ScalarWriter
+from .c import Names, ScalarWriter, random_numbers
 from .schedule import Schedule, Sizes
 from .tables import TableWriter, Text
 
@@ -96,6 +96,7 @@ class _CudaWriter(ScalarWriter, TableWriter):
     def write(self, following: Sequence[int], outputs: Sequence[int]) -> Text:
         body = self._function(lambda: self._body(following, outputs))
         source = [_PRELUDE + "\n".join(self._arguments()), *self._constants]
+        source += random_numbers(body, self.real, "__device__ inline")
         source += [f'extern "C" __global__ void {KERNEL}(const __grid_constant__ Call call)', *body]
         return Text("\n".join(source) + "\n", self.table, self.parameters)
 

@@ -232,6 +232,12 @@ RULES["mul"] = lambda t, out, a, b: (
 )
 
 
+@rule("staf_torch::philox")
+def _philox(t: Tracer, out: Tensor, *args: Any) -> Ids:
+    *parts, second = args
+    return t.map("philox_second" if second else "philox_first", *numbers(t, t.kind(out.dtype), *parts))
+
+
 @rule("signbit")
 def _signbit(t: Tracer, out: Tensor, a: Tensor) -> Ids:
     kind = t.kind(a.dtype)  # of zeros, too

@@ -1,0 +1,99 @@
+"""Random numbers that are a function of a seed and a counter: the same on every back end, for every batch.
+
+Philox 4x32-10 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011) is ten rounds of
+products of 32-bit words. Nothing is carried from number to number, so that a row has its own whatever the
+others do, and a step of a row program draws them where it runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+_WORD, _HALF = 0xFFFFFFFF, 0xFFFF
+_FACTORS, _WEYL, ROUNDS = (0xD2511F53, 0xCD9E8D57), (0x9E3779B9, 0xBB67AE85), 10
+
+
+def words(counter: Sequence[Tensor], key: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return four random words of 32 bits, each (...), int64.
+
+    Example:
+        >>> from staf_torch.lanes.philox import words
+        >>> zero = torch.zeros((), dtype=torch.int64)
+        >>> [f"{int(word):08x}" for word in words([zero] * 4, [zero] * 2)]
+        ['6627e8d5', 'e169c58d', 'bc57ac4c', '9b00dbd8']
+
+    Args:
+        counter: four words, (...), int64.
+        key: two words.
+    """
+    a, b, c, d = counter
+    one, other = key
+    for _ in range(ROUNDS):
+        (high, low), (high_, low_) = _product(a, _FACTORS[0]), _product(c, _FACTORS[1])
+        a, b, c, d = high_ ^ b ^ one, low_, high ^ d ^ other, low
+        one, other = (one + _WEYL[0]) & _WORD, (other + _WEYL[1]) & _WORD
+    return a, b, c, d
+
+
+def _product(word: Tensor, factor: int) -> tuple[Tensor, Tensor]:
+    """High and low word of a product, without an overflow of 64 bits."""
+    high, low = word * (factor >> 16), word * (factor & _HALF)
+    return (high + (low >> 16)) >> 16, (low + ((high & _HALF) << 16)) & _WORD
+
+
+def seed_parts(seeds: Sequence[int], like: Tensor) -> Tensor:
+    """Return the four 16-bit parts of seeds, (B, 4), which every float holds."""
+    rows = [[(seed >> (16 * k)) & _HALF for k in range(4)] for seed in seeds]
+    return torch.tensor(rows, dtype=like.dtype, device=like.device)
+
+
+def uniform(seed: Tensor, step: Tensor, count: int) -> Tensor:
+    """Return numbers uniform on [-1, 1) from 53 random bits each, (B, count), of the dtype of ``step``.
+
+    Args:
+        seed: of `seed_parts`, (B, 4).
+        step: whole numbers from 0 to 2^32 - 1, (B,).
+        count: of numbers.
+    """
+    at = step.detach()
+    high = (at / 65536).floor()
+    parts = [*seed.detach().unbind(-1), at - 65536 * high, high]
+    block = torch.arange((count + 1) // 2, dtype=at.dtype, device=at.device)
+    given = [part.unsqueeze(-1).expand(*part.shape, len(block)) for part in parts]
+    both = [
+        torch.ops.staf_torch.philox(*given, block.expand_as(given[0]), second) for second in (False, True)
+    ]
+    return torch.stack(both, dim=-1).flatten(-2)[..., :count]
+
+
+def _numbers(
+    a: Tensor, b: Tensor, c: Tensor, d: Tensor, low: Tensor, high: Tensor, block: Tensor, second: bool
+) -> Tensor:
+    """The first or second number of a block: key (a, b), (c, d), counter (low, high), block, 0, 0."""
+    key = [one.long() + (other.long() << 16) for one, other in ((a, b), (c, d))]
+    step, place = low.long() + (high.long() << 16), block.long()
+    none = torch.zeros_like(place)
+    one, other = words((step, place, none, none), key)[2 * second : 2 * second + 2]
+    return ((one << 21) + (other >> 11) - 2**52).to(low.dtype) * 2.0**-52
+
+
+_LIBRARY = torch.library.Library("staf_torch", "FRAGMENT")
+_PARTS = ", ".join(f"Tensor {name}" for name in ("a", "b", "c", "d", "low", "high", "block"))
+_LIBRARY.define(f"philox({_PARTS}, bool second) -> Tensor")
+_LIBRARY.impl("philox", _numbers, "CompositeExplicitAutograd")
+
+
+def _of_rows(info: object, dims: Sequence[int | None], *args: object) -> tuple[Tensor, int]:
+    given = list(args)
+    deep = max(x.dim() - (at is not None) for x, at in zip(given, dims, strict=True) if isinstance(x, Tensor))
+    for k, (x, at) in enumerate(zip(given, dims, strict=True)):
+        if isinstance(x, Tensor) and at is not None:
+            x = x.movedim(at, 0)
+            given[k] = x.reshape(len(x), *[1] * (deep + 1 - x.dim()), *x.shape[1:])
+    return torch.ops.staf_torch.philox(*given), 0
+
+
+torch.library.register_vmap("staf_torch::philox", _of_rows, lib=_LIBRARY)
