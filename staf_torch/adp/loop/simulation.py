@@ -182,8 +182,8 @@ def simulate(
 ) -> LoopResult:
     """The closed loop of a controller and a plant from the initial states x0.
 
-    Random numbers of row b are a function of its seed, ``seed + b``, and of the step (Philox 4x32-10): what it
-    does depends on no other row, and is the same on every device.
+    Random numbers of row b are a function of its seed, ``seed + b``, and of the step (Philox 4x32-10): what
+    it does depends on no other row, and is the same on every device.
 
     Example:
         >>> plant = systems.TwoState()
