@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from .. import __version__
 from ..adp import Controller, Feedback, LoopResult, SafetyFilter, Supervised, simulate
-from ..adp.loop.drawing import points_of_steps
+from ..adp.loop.drawing import by_generator, generated, points_of_steps
 from ..adp.loop.setup import AdpProblem
 from ..adp.planning.receding_horizon import StrainedPlans
 from ..approximation.staf import StaF
@@ -341,7 +341,11 @@ def _learner(cfg: DictConfig, history: dict[str, Tensor], precise: bool, row: in
         raise fail("staf-export", "learning", "must be left away where nothing learns", what)
     found, steps = _replayed(problem, history, precise, row)
     x0, seed = problem.initial_states[row : row + 1], problem.seed + row
-    uniform = points_of_steps(x0, [seed], 0, steps, problem.controller.draws)[0]
+    draws = problem.controller.draws
+    if by_generator(problem.controller):
+        uniform = generated(x0, steps, draws, [torch.Generator().manual_seed(seed)])[0]
+    else:
+        uniform = points_of_steps(x0, [seed], 0, steps, draws)[0]
     unit, size = problem.system.units, x0.shape[-1]
     inputs = [Port("x", size, unit.state, "as the weights have learned it" if learns else "of the plant")]
     if problem.controller.draws:

@@ -19,6 +19,7 @@ from staf_torch.cli.deployable import deployable, learning
 from staf_torch.cli.export import export, export_learning, main
 from staf_torch.deploy.c_header import runner_c
 from staf_torch.experiments.registry import experiment
+from staf_torch.lanes import philox
 
 needs_cc = pytest.mark.skipif(
     not any(map(shutil.which, ("cc", "gcc", "g++", "clang"))), reason="no C compiler"
@@ -161,9 +162,9 @@ def test_a_run_of_every_policy_is_rebuilt_and_compared_over_the_region_that_it_v
 def test_a_learner_sees_the_states_and_random_numbers_of_its_run(row: int, runs: Path) -> None:
     found = learning(runs / "actor", row)
     np.testing.assert_allclose(found.states[::2], history(runs / "actor")["state"][row, :-1], rtol=1e-9)
-    generator = torch.Generator().manual_seed(row)
-    drawn = torch.empty(20, 1, 2, dtype=torch.float64).uniform_(-1, 1, generator=generator)
-    assert torch.equal(found.uniform, drawn)
+    step = torch.arange(20, dtype=torch.float64)
+    drawn = philox.uniform(philox.seed_parts([row], step).expand(20, 4), step, 2)
+    assert torch.equal(found.uniform[:, 0], drawn)
     assert (found.dt, found.written_by) == (0.005, None)
     plain = learning(runs / "quadrature")  # which draws no random numbers
     assert [port.name for port in plain.inputs] == ["x"]
