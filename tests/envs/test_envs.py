@@ -19,6 +19,7 @@ from staf_torch import (
     rings,
     systems,
 )
+from staf_torch.lanes import philox
 
 gymnasium = pytest.importorskip("gymnasium", reason="needs the extra gym")
 
@@ -102,18 +103,19 @@ def test_rows_of_an_agent_draw_from_their_own_seeds(seed: int) -> None:
     controller = Recorder(draws=3)
     agent = envs.Agent(controller, dt=0.5, seed=seed) if seed else envs.Agent(controller)
     observation = np.array([[1.0, 2.0], [3.0, 4.0]], dtype=np.float32)
-    draw = [torch.Generator().manual_seed(seed + row) for row in range(2)]
-    rounds = []
+    parts, rounds = philox.seed_parts([seed, seed + 1], torch.empty(0, dtype=torch.float64)), []
     for at in range(2):
         found = agent(observation)
         np.testing.assert_array_equal(found, [[at, 1.0, 2.0], [at, 3.0, 4.0]])
-        rounds.append(torch.stack([torch.rand(3, 2, dtype=torch.float64, generator=each) for each in draw]))
+        rounds.append(
+            philox.uniform(parts, torch.full((2,), float(at), dtype=torch.float64), 6).view(2, 3, 2)
+        )
     agent.begin()
     np.testing.assert_array_equal(agent(torch.from_numpy(observation))[:, 0], 0.0)
     for (x, uniform, dt), wanted in zip(controller.seen, [*rounds, rounds[0]], strict=True):
         assert x.dtype == torch.float64
         assert dt == (0.5 if seed else 0.01)
-        assert torch.equal(uniform, 2 * wanted - 1)
+        assert torch.equal(uniform, wanted)
 
 
 @pytest.mark.parametrize(

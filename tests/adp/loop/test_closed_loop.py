@@ -15,6 +15,7 @@ from helpers_adp import uniform as drawn
 from torch import Tensor, nn
 
 from staf_torch import adp, lanes, systems
+from staf_torch.lanes import philox
 
 LQR = adp.LQR(TWO_STATE, COST)
 UNSTABLE = systems.Linear([[0.0, 1.0], [2.0, -1.0]], [[0.0], [1.0]])
@@ -142,10 +143,10 @@ def test_a_control_is_held_for_the_period_of_the_controller_or_the_plant_or_a_mi
 
 
 def test_pieces_of_a_run_change_nothing() -> None:
-    """Random numbers are drawn for about a thousand steps at once: as one stream a row."""
+    """Random numbers are those of the row's seed and the step, however many steps a call takes."""
     whole = run(Noisy(), x0=X0[:1], steps=1050, seed=3)
-    numbers = torch.empty(1050, 4, dtype=torch.float64)
-    numbers.uniform_(-1.0, 1.0, generator=torch.Generator().manual_seed(3))
+    step = torch.arange(1050, dtype=torch.float64)
+    numbers = philox.uniform(philox.seed_parts([3], step).expand(1050, 4), step, 4)
     torch.testing.assert_close(whole.control[0, :-1, 0], numbers.sum(-1))
     done: list[int] = []
     some = run(Noisy(), x0=X0[:1], steps=1050, seed=3, every=7, progress=done.append)
