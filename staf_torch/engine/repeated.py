@@ -97,6 +97,7 @@ class Repeated:
 
 
 _known: dict[Hashable, Repeated] = {}
+_once: dict[Hashable, Problem] = {}  # chases made one time, kept so that an address is used once
 
 
 def repeated(key: Hashable) -> Repeated | None:
@@ -113,13 +114,18 @@ def remember(
     everything: bool,
     history: bool,
 ) -> None:
-    """Prepare for a chase to be made again, where its program needs no more than its states.
+    """Prepare for a chase that is made for the second time, where its program needs no more than its states.
 
     Args:
         key: of `key_of`.
         program, problem, states, everything, history: as in `Repeated`.
     """
     if key is None or program is None or is_users(type(problem.law)) or program.has_rows():
+        return
+    if _once.pop(key, None) is None:  # to prepare takes as long as a short chase
+        while len(_once) >= _MOST:
+            del _once[next(iter(_once))]
+        _once[key] = problem
         return
     while len(_known) >= _MOST:
         del _known[next(iter(_known))]
