@@ -29,6 +29,7 @@ Sink = Callable[[Mapping[str, np.ndarray], int, int], None]
 HISTORY = ("state", "value", "estimate", "weights", "ideal_weights", "excess")
 _DRAWN = (*HISTORY, "ideal_estimate")
 _ROWS = 4096  # at most that go through time together: memory does not grow with rows
+_ON_DEVICE = 32  # times as many rows there, and as much memory: a launch costs as much for few as for many
 _FEW, _BYTES = 64, 2**26  # rows at least, and bytes at most, where a history is kept: it is written by rows
 _DRAWN_TIMES = 4000  # more could not be told apart in print
 
@@ -140,13 +141,15 @@ def _run(
         errors=errors,
     )
     tell = _of_whole_problems(advance, len(starts), len(members))
-    together = _ROWS
+    share = 1 if starts.is_cpu else _ON_DEVICE
+    together = share * _ROWS
     if any(member.sink is not None for member in members):
         kept = starts.shape[1] + 3 + 2 * basis.count  # numbers of a row and time, of `HISTORY`
         whole = _BYTES // (times * kept * starts.element_size())  # rows with all times
-        together = min(_ROWS, max(_FEW, whole))
+        together = min(together, max(_FEW, whole))
     blocks = starts.split(together)
-    chunk = chunk_length(min(together, len(starts)), basis, starts.element_size())
+    few = -(-min(together, len(starts)) // share)
+    chunk = chunk_length(few, basis, starts.element_size())
     # Some twenty pieces of a long run, so that progress is seen; the results do not depend on it.
     chunk = max(1, min(chunk, max(64, -(-times // 20))))
     told = alone and len(blocks) == 1  # the engine warns of the reach, else each member of its own

@@ -107,8 +107,9 @@ class ChaseMetrics:
         batch, length, _ = result.state.shape
         firsts = self._firsts(rows.first, batch)  # of the window, of each row
         early, skip = (min(max(int(k) - rows.time, 0), length) for k in (firsts.max(), firsts.min()))
-        index = torch.arange(rows.time, rows.time + length, device="cpu")
-        settled = (index >= firsts.unsqueeze(-1)).to(result.state.device)  # (B, C)
+        where = result.state.device
+        index = torch.arange(rows.time, rows.time + length, device=where)
+        settled = index >= firsts.to(where).unsqueeze(-1)  # (B, C)
         rows.time += length
         rows.diverged = result.diverged
         if early > 0:
