@@ -13,7 +13,7 @@ from ..centers import StateFollowingCenters
 from ..kernels import Kernel
 from ..lanes.one_thread import small
 from ..lanes.row_numbers import over_rows
-from ..lanes.row_objects import Rowwise
+from ..lanes.row_objects import Rowwise, beyond_rows
 from ..local_basis import Degrees, LocalBasis, LocalSpace
 from ..numerics.checks import learns, sampled, trailing, values_of
 from ..numerics.row_checks import check_kernel
@@ -204,7 +204,7 @@ class StaFBasis(nn.Module, metaclass=Rowwise):
             f"relative change of basis(x, x) between states: {change:.2g}): V^(x) = basis(x, x) @ w is a "
             f"constant unless w depends on x. Take `AnchoredKernel({kernel}(...))`, `ExponentialKernel()`, "
             f"{moving}or such weights.",
-            stacklevel=stacklevel,
+            stacklevel=beyond_rows(stacklevel),
         )
         return True
 

@@ -12,10 +12,11 @@ import abc
 import contextlib
 import functools
 import inspect
+import sys
 import threading
 import weakref
 from collections.abc import Callable, Sequence
-from types import CellType, FunctionType, MethodType
+from types import CellType, FrameType, FunctionType, MethodType
 from typing import Any, ParamSpec, TypeVar
 
 import torch
@@ -208,6 +209,17 @@ def _of_points(method: Any, dims: Sequence[int]) -> Any:
         return over_rows(at, *given)
 
     return of_points
+
+
+def beyond_rows(stacklevel: int) -> int:
+    """Return the ``stacklevel`` of a warning of the caller's, of which frames of numbers of rows are none."""
+    frame: FrameType | None = sys._getframe(1)
+    level = seen = 0
+    while frame is not None and seen < stacklevel:
+        level += 1
+        seen += not frame.f_globals.get("__name__", "").startswith(__package__)
+        frame = frame.f_back
+    return level
 
 
 def _holds_rows(value: Any) -> bool:

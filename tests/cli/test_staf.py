@@ -327,7 +327,7 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
     "unknown group": ("sytem=pendulum", ("did you mean `system`?",)),
     "key of another choice": (
         "kernel.width=0.5",
-        ("`kernel.width` with what is chosen; kernel=gaussian has it.",),
+        ("`kernel.width` with what is chosen; ", "kernel=gaussian has it."),
     ),
     "swept choices of which one has a key": (
         "-m kernel=gaussian,custom kernel.path=a.B",
