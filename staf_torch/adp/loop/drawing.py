@@ -17,7 +17,8 @@ def by_generator(controller: nn.Module) -> bool:
 
 def points_of_step(seed: Tensor, step: Tensor, draws: int, dim: int) -> Tensor:
     """Return uniform numbers on [-1, 1), (B, draws, n): those of a row's seed (B, 4) at a step (B,)."""
-    return uniform(seed, step, draws * dim).unflatten(-1, (draws, dim))
+    drawn: Tensor = uniform(seed, step, draws * dim).unflatten(-1, (draws, dim))
+    return drawn
 
 
 def points_of_steps(x: Tensor, seeds: Sequence[int], first: int, count: int, draws: int) -> Tensor:

@@ -27,8 +27,8 @@ starts = torch.tensor([[-1.0, 1.0], [1.0, 1.0], [0.5, -1.0], [-1.0, -0.5]]).doub
 
 # %% [markdown]
 # The published gains are the start; their logarithms are learned, so that they stay positive. The first step
-# compiles the loop and its adjoint, a later one takes a tenth of a second. It ends early: some steps further an
-# actor that follows its critic too fast diverges from one of the four starts.
+# compiles the loop and its adjoint, a later one takes a tenth of a second. It ends early: some steps
+# further an actor that follows its critic too fast diverges from one of the four starts.
 
 # %%
 logarithms = torch.tensor([0.001, 0.25, 1.2, 0.01]).double().log().requires_grad_()
