@@ -124,11 +124,11 @@ def remember(
         return
     if _once.pop(key, None) is None:  # to prepare takes as long as a short chase
         while len(_once) >= _MOST:
-            del _once[next(iter(_once))]
+            _once.pop(next(iter(_once)), None)  # by whichever thread comes first
         _once[key] = problem
         return
     while len(_known) >= _MOST:
-        del _known[next(iter(_known))]
+        _known.pop(next(iter(_known)), None)
     _known[key] = Repeated(program, problem, states, everything=everything, history=history)
 
 

@@ -1,0 +1,168 @@
+"""Forward and backward passes over the compiled forward pass, on one core, beside JAX where it is installed.
+
+With nothing else running: `python tests/benchmarks/gradients.py [--only lorenz,chase3]`. JAX
+(`pip install jax`) differentiates the same step: `jax.grad` of the `lax.scan`, jitted, in float64, all rows
+in one array.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from staf_torch import (
+    AnchoredKernel,
+    ExponentialKernel,
+    GaussianKernel,
+    StaFBasis,
+    StateFollowingCenters,
+    StateRadius,
+    adp,
+    chase_weights,
+    lanes,
+    optim,
+    rings,
+    systems,
+)
+
+F64 = torch.float64
+Loss = Callable[[], Tensor]
+
+
+def least(function: Callable[[], Any], seconds: float = 4.0) -> float:
+    """The least processor time of a call, in ms, over some seconds of calls."""
+    function()
+    best, end = float("inf"), time.perf_counter() + seconds
+    while time.perf_counter() < end:
+        begin = time.process_time()
+        function()
+        best = min(best, time.process_time() - begin)
+    return 1e3 * best
+
+
+def lorenz_step(x: Tensor, now: Any, rho: Tensor) -> tuple[Tensor, tuple[()]]:
+    """A step of Euler, all in registers."""
+    a, b, c = x.unbind(-1)
+    return x + 0.001 * torch.stack((10.0 * (b - a), a * (rho - c) - b, a * b - 8.0 / 3.0 * c), -1), ()
+
+
+def lorenz() -> tuple[Loss, list[Tensor]]:
+    program = lanes.Program(lorenz_step)
+    x0 = torch.tensor([1.0, 0.0, 0.0], dtype=F64).repeat(1000, 1).requires_grad_()
+    rho = torch.linspace(0.0, 21.0, 1000, dtype=F64).requires_grad_()
+    return lambda: program(x0, (), rho, steps=1000)[0].square().sum(), [x0, rho]
+
+
+def chased(count: int, times: int) -> tuple[Loss, list[Tensor]]:
+    """By the width, V's parameters and the first weights."""
+    states = systems.simulate(systems.Oscillator(), torch.randn(1000, 2, dtype=F64), dt=0.01, steps=times - 1)
+    width, scale = torch.tensor(1.1, dtype=F64), torch.tensor([1.0, 0.5], dtype=F64)
+    first = torch.randn(1000, count, dtype=F64)
+    wanted = [each.requires_grad_() for each in (width, scale, first)]
+    basis = StaFBasis(GaussianKernel(width), StateFollowingCenters(rings(count), radius=0.3))
+    law = optim.SteepestDescent()
+
+    def value(x: Tensor) -> Tensor:
+        return (scale * x.square()).sum(-1) + x[..., 0] * x[..., 1].sin()
+
+    return lambda: chase_weights(states, basis, value, law, weights=first).weights.square().mean(), wanted
+
+
+def network() -> tuple[Loss, list[Tensor]]:
+    layers = [torch.nn.Linear(2, 32), torch.nn.Tanh(), torch.nn.Linear(32, 32), torch.nn.Tanh()]
+    net = torch.nn.Sequential(*layers, torch.nn.Linear(32, 1)).double()
+    states = systems.simulate(systems.Oscillator(), torch.randn(1000, 2, dtype=F64), dt=0.01, steps=199)
+    basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.3))
+    law = optim.SteepestDescent()
+
+    def value(x: Tensor) -> Tensor:
+        found: Tensor = net(x).squeeze(-1)
+        return found
+
+    return lambda: chase_weights(states, basis, value, law).weights.square().mean(), list(net.parameters())
+
+
+def learner() -> tuple[Loss, list[Tensor]]:
+    plant, cost = systems.TwoState(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+    centers = StateFollowingCenters(rings(3), StateRadius(0.7, 1e-5))
+    basis = adp.StaFValueBasis(StaFBasis(AnchoredKernel(ExponentialKernel()), centers)).double()
+    points = adp.RandomPoints(1, StateRadius(2.1, 1e-5))
+    x0 = torch.tensor([-1.0, 1.0], dtype=F64) + 0.1 * torch.randn(1000, 2, dtype=F64)
+    gain = torch.tensor(1.2, dtype=F64).requires_grad_()
+    critic = torch.tensor(0.4, dtype=F64).requires_grad_()
+
+    def loss() -> Tensor:
+        law = adp.Information(adp.Gains(actor=gain))
+        actor_critic = adp.ActorCritic(basis, plant, cost, points, law, critic=critic)
+        found: Tensor = adp.simulate(
+            actor_critic, plant, cost, x0, dt=0.001, steps=2000, compile=True
+        ).cost.mean()
+        return found
+
+    return loss, [gain, critic]
+
+
+CASES: dict[str, Callable[[], tuple[Loss, list[Tensor]]]] = {
+    "lorenz": lorenz,
+    "chase3": lambda: chased(3, 100),
+    "chase6": lambda: chased(6, 100),
+    "chase15": lambda: chased(15, 100),
+    "network": network,
+    "learner": learner,
+}
+
+
+def of_jax() -> float | None:
+    """Milliseconds of JAX's forward and backward pass of `lorenz`; None without JAX."""
+    try:
+        import jax
+        import jax.numpy as jnp
+    except ImportError:
+        return None
+    jax.config.update("jax_enable_x64", True)
+
+    def step(state: Any, _: Any) -> tuple[Any, None]:
+        (a, b, c), rho = state
+        moved = (a + 0.01 * (b - a), b + 0.001 * (a * (rho - c) - b), c + 0.001 * (a * b - 8.0 / 3.0 * c))
+        return (moved, rho), None
+
+    def loss(x: Any, rho: Any) -> Any:
+        (end, _), _ = jax.lax.scan(step, (x, rho), None, length=1000)
+        return sum((part**2).sum() for part in end)
+
+    both = jax.jit(jax.grad(loss, argnums=(0, 1)))
+    x, rho = (jnp.ones(1000), jnp.zeros(1000), jnp.zeros(1000)), jnp.linspace(0.0, 21.0, 1000)
+    return least(lambda: jax.block_until_ready(both(x, rho)))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", default=",".join(CASES))
+    chosen = parser.parse_args().only.split(",")
+    torch.manual_seed(0)
+    torch.set_num_threads(1)
+    for name in chosen:
+        loss, wanted = CASES[name]()
+
+        def both(loss: Loss = loss, wanted: list[Tensor] = wanted) -> Any:
+            return torch.autograd.grad(loss(), wanted)
+
+        with torch.no_grad():
+            forward = least(loss)
+        begin = time.process_time()
+        both()
+        first = time.process_time() - begin
+        together = least(both)
+        ratio = f"ratio {together / forward:.2f}; first {first:.1f} s"
+        print(f"{name:8} forward {forward:8.2f} ms, with gradient {together:8.2f} ms, {ratio}")
+        if name == "lorenz" and (peer := of_jax()) is not None:
+            print(f"{name:8} JAX      {peer:.2f} ms of processor time: {peer / together:.1f} times")
+
+
+if __name__ == "__main__":
+    main()
