@@ -46,9 +46,17 @@ def least(function: Callable[[], Any], seconds: float = 4.0) -> float:
 
 
 def lorenz_step(x: Tensor, now: Any, rho: Tensor) -> tuple[Tensor, tuple[()]]:
-    """A step of Euler, all in registers."""
-    a, b, c = x.unbind(-1)
-    return x + 0.001 * torch.stack((10.0 * (b - a), a * (rho - c) - b, a * b - 8.0 / 3.0 * c), -1), ()
+    """A classical Runge-Kutta step."""
+
+    def rate(x: Tensor) -> Tensor:
+        a, b, c = x.unbind(-1)
+        return torch.stack((10.0 * (b - a), a * (rho - c) - b, a * b - 8.0 / 3.0 * c), dim=-1)
+
+    h = 0.001
+    k1 = rate(x)
+    k2 = rate(x + h / 2 * k1)
+    k3 = rate(x + h / 2 * k2)
+    return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + rate(x + h * k3)), ()
 
 
 def lorenz() -> tuple[Loss, list[Tensor]]:
@@ -98,7 +106,7 @@ def learner() -> tuple[Loss, list[Tensor]]:
 
     def loss() -> Tensor:
         law = adp.Information(adp.Gains(actor=gain))
-        actor_critic = adp.ActorCritic(basis, plant, cost, points, law, critic=critic)
+        actor_critic = adp.ActorCritic(basis, plant, cost, points, law, critic=critic.expand(3))
         found: Tensor = adp.simulate(
             actor_critic, plant, cost, x0, dt=0.001, steps=2000, compile=True
         ).cost.mean()
@@ -126,10 +134,21 @@ def of_jax() -> float | None:
         return None
     jax.config.update("jax_enable_x64", True)
 
+    def rate(x: Any, rho: Any) -> Any:
+        a, b, c = x
+        return 10.0 * (b - a), a * (rho - c) - b, a * b - 8.0 / 3.0 * c
+
+    def along(x: Any, share: float, k: Any) -> Any:
+        return tuple(p + share * q for p, q in zip(x, k, strict=True))
+
     def step(state: Any, _: Any) -> tuple[Any, None]:
-        (a, b, c), rho = state
-        moved = (a + 0.01 * (b - a), b + 0.001 * (a * (rho - c) - b), c + 0.001 * (a * b - 8.0 / 3.0 * c))
-        return (moved, rho), None
+        (x, rho), h = state, 0.001
+        k1 = rate(x, rho)
+        k2 = rate(along(x, h / 2, k1), rho)
+        k3 = rate(along(x, h / 2, k2), rho)
+        k4 = rate(along(x, h, k3), rho)
+        stages = zip(x, k1, k2, k3, k4, strict=True)
+        return (tuple(p + h / 6 * (a + 2 * b + 2 * c + d) for p, a, b, c, d in stages), rho), None
 
     def loss(x: Any, rho: Any) -> Any:
         (end, _), _ = jax.lax.scan(step, (x, rho), None, length=1000)
