@@ -47,11 +47,11 @@ def _map(figure: Figure, axes: Axes, picture: LearnedKernel) -> list[Artist]:
     axes.set(xscale="log", yscale="log", xlabel=picture.name, ylabel="radius $r$ of the centers")
     axes.grid(False)
     axes.plot(*picture.path.T, ".-", color="white", markersize=2, linewidth=0.8)
-    row, column = np.unravel_index(np.nanargmin(picture.grid), picture.grid.shape)
+    row, column = np.unravel_index(_least(picture.grid), picture.grid.shape)
     drawn = {
         "start": (picture.path[0], "o"),
         "best of the grid": ((picture.widths[column], picture.radii[row]), "s"),
-        "least of the way": (picture.path[np.nanargmin(picture.errors)], "*"),
+        "least of the way": (picture.path[_least(picture.errors)], "*"),
     }
     marks: list[Artist] = []
     for label, (at, kind) in drawn.items():
@@ -67,9 +67,14 @@ def _map(figure: Figure, axes: Axes, picture: LearnedKernel) -> list[Artist]:
     return marks
 
 
+def _least(errors: np.ndarray) -> int:
+    """The place of the least error that is known, the first where none is."""
+    return int(np.nan_to_num(errors, nan=np.inf).argmin())
+
+
 def _steps(axes: Axes, picture: LearnedKernel, marks: list[Artist]) -> None:
     (line,) = axes.semilogy(picture.errors, color=colour(0), label="gradient")
-    best = np.nanmin(picture.grid)
+    best = picture.grid.flat[_least(picture.grid)]
     floor = axes.axhline(best, color="0.2", linestyle=":", linewidth=0.8, label="least of the grid")
     axes.set(xlabel="step of Adam", ylabel="root mean square error on the ball")
     axes.margins(x=0)

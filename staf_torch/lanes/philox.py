@@ -53,6 +53,8 @@ def seed_parts(seeds: Sequence[int], like: Tensor) -> Tensor:
 def uniform(seed: Tensor, step: Tensor, count: int) -> Tensor:
     """Return numbers uniform on [-1, 1) from 53 random bits each, (B, count), of the dtype of ``step``.
 
+    In float32 the largest are rounded to 1.
+
     Args:
         seed: of `seed_parts`, (B, 4).
         step: whole numbers from 0 to 2^32 - 1, (B,).
