@@ -31,7 +31,8 @@ def words(counter: Sequence[Tensor], key: Sequence[Tensor]) -> tuple[Tensor, Ten
         counter: four words, (...), int64.
         key: two words.
     """
-    return _mixed(counter, key, _product)
+    a, b, c, d = _mixed(counter, key, _product)
+    return a, b, c, d
 
 
 def _mixed(counter: Sequence[Any], key: Sequence[Any], product: Callable[[Any, int], tuple[Any, Any]]) -> Any:
@@ -92,8 +93,8 @@ def _numbers(
     none = torch.zeros_like(place)
     counter, chosen = (step, place, none, none), slice(2 * second, 2 * second + 2)
     if type(low) is Tensor and low.is_cpu and low.dim():  # a plain loop of few rows draws at every step
-        arrays = ([part.numpy().astype(np.uint64) for part in parts] for parts in (counter, key))
-        one, other = map(_signed, _mixed(*arrays, _unsigned_product)[chosen])
+        at, by = ([part.numpy().astype(np.uint64) for part in parts] for parts in (counter, key))
+        one, other = map(_signed, _mixed(at, by, _unsigned_product)[chosen])
     else:
         one, other = words(counter, key)[chosen]
     return ((one << 21) + (other >> 11) - 2**52).to(low.dtype) * 2.0**-52
