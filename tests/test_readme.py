@@ -1,14 +1,19 @@
-"""The manuals: Python blocks run, links lead somewhere, every command and file that they name exists."""
+"""The manuals: Python blocks run, and commands of guides; links lead somewhere, what they name exists.
+
+Blocks that are only shown are marked ```py or ```text.
+"""
 
 from __future__ import annotations
 
 import importlib.util
 import re
 import shlex
+import shutil
 import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import guides
 import pytest
 from command_line import ROOT
 from composing import settings
@@ -54,29 +59,27 @@ def test_citation_is_of_this_version_and_names_the_paper() -> None:
 # --- Python -------------------------------------------------------------------------------------------------
 
 
-def python_blocks(path: Path) -> list[tuple[int, str]]:
-    """Line and text of each ```python block; blocks that are only shown are marked ```py."""
-    text = read(path)
-    found = re.finditer(r"^```python\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
-    return [(text[: block.start(1)].count("\n"), block[1]) for block in found]
-
-
 def asked(path: Path) -> object:
     """A page, whose chases are compiled where it has long ones."""
-    marks = [pytest.mark.compiled] if path in (README, ROOT / "staf_torch" / "sweeps" / "README.md") else []
+    long = path in (README, ROOT / "staf_torch" / "sweeps" / "README.md") or path.parent == guides.GUIDES
+    marks = [pytest.mark.compiled] if long else []
     return pytest.param(path, marks=marks, id=name(path))
 
 
-@pytest.mark.parametrize("path", [asked(p) for p in [README, *MANUALS] if python_blocks(p)])
-def test_python_blocks_of_a_page_run_one_after_another(
+@pytest.mark.parametrize("path", [asked(p) for p in [README, *MANUALS] if any(guides.blocks(p, ("python",)))])
+def test_blocks_of_a_page_run_one_after_another(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     if path.parent.name == "deploy" and not compiler.compiler():
         pytest.skip("its C is compiled")
-    names: dict[str, object] = {"__name__": "__main__"}
-    for line, text in python_blocks(path):
-        exec(compile("\n" * line + text, name(path), "exec"), names)
+    if path not in guides.guides():
+        return guides.run_page(path, ("python",))
+    if path.stem == "plant_to_c" and not shutil.which("gcc"):
+        pytest.skip("its C is compiled")
+    guides.run_page(path)
+    assert (tmp_path / f"{path.stem}.png").exists(), "a guide ends with a picture that its reader gets"
+    assert f"](pictures/{path.stem}.webp)" in read(path)
 
 
 # --- the front page -----------------------------------------------------------------------------------------
