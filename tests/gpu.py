@@ -13,10 +13,14 @@ import concurrent.futures
 import functools
 import io
 import itertools
+import json
+import math
 import multiprocessing
 import os
 import statistics
+import subprocess
 import sys
+import tempfile
 import time
 import traceback
 import warnings
@@ -30,6 +34,7 @@ from torch import Tensor
 
 from staf_torch import lanes
 from tests import gpu_cases as cases
+from tests import gpu_peers as peers
 from tests.registers import ptxas
 
 FEW, BUILT = 16, 32
@@ -37,12 +42,18 @@ CLOSE, ROUNDED, POSED = 1e-12, 4.0, 1e-3
 """What a float64 number may be off by; and by how many times what plain torch's of float32 is,
 which is at most that much."""
 DTYPES = torch.float64, torch.float32
+EXPERIMENTS = "avoidance", "safe_box", "exponential_bound", "feasibility"
+EXPERIMENT_SECONDS, ALIKE = 75, 1e-6
 Make = Callable[[int, torch.dtype], cases.Case]
 KINDS: dict[str, tuple[Make, tuple[int, ...]]] = {
     "M = 3 SteepestDescent, 100": (cases.weights(3, "SteepestDescent", 100), (100_000, 1_000_000)),
     "M = 6 ConjugateGradient": (cases.weights(6, "ConjugateGradient", 16), (100_000, 1_000_000)),
     "M = 15 SteepestDescent": (cases.weights(15, "SteepestDescent", 16), (100_000, 1_000_000)),
     "few rows": (cases.weights(3, "SteepestDescent", 400), (1000,)),
+    **{
+        f"M = 15 {law}": (cases.weights(15, law, 16), (100_000,))
+        for law in ("Nesterov", "HeavyBall", "Exact")
+    },
     "flow": (cases.flows, (1, 1000, 100_000)),
     "pendulum": (cases.pendulums, (1, 1000, 1_000_000)),
     "float32 within": (cases.mixed, (1000, 1_000_000)),
@@ -51,6 +62,8 @@ KINDS: dict[str, tuple[Make, tuple[int, ...]]] = {
     "stiff loop": (cases.stiff_loops, (1000, 1_000_000)),
     "Lorenz, Tsit5": (cases.lorenzes, (1000, 8_388_608)),
     "information actor-critic": (cases.information, (1000, 100_000)),
+    "random points made there": (cases.random_points, (1000, 100_000)),
+    "gradient of Lorenz": (cases.lorenz_gradients, (1000,)),
     "SafetyFilter": (cases.filtered, (1000, 100_000)),
     "RolloutPolicy": (cases.rollouts, (1000, 100_000)),
     "mass of a row's own": (cases.masses, (1000, 1_000_000)),
@@ -61,7 +74,6 @@ for _count, _law in itertools.product((3, 6, 15), cases.LAWS):
     _few = (_count, _law) in ((15, "ConjugateGradient"), (15, "BarzilaiBorwein"), (6, "BarzilaiBorwein"))
     _name = f"M = {_count} {_law}" + ", 2 its" * _few
     KINDS.setdefault(_name, (cases.weights(_count, _law, 16, 2 if _few else 10), (100_000,)))
-PEERS = 3  # kinds, the first ones, that peers do too
 WITHIN = {"float32 within": 1e-7}
 """float64 cases that compute in float32 inside: a sine of float32 is right to two units."""
 
@@ -160,24 +172,71 @@ def bound_of(name: str, dtype: torch.dtype, off: float) -> float:
     return ROUNDED * off + 1e-6 if off < POSED else float("nan")
 
 
-def build(name: str, dtype: torch.dtype) -> tuple[str, bytes]:
-    """Leave a kernel in the cache and find the truth, in a process of its own."""
+def build(name: str, dtype: torch.dtype) -> tuple[str, bytes, float]:
+    """Leave a kernel in the cache and find the truth, in a process of its own; and the seconds it took."""
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
+    begin = time.perf_counter()
     try:
         case = KINDS[name][0](BUILT, dtype)
         case.to(DEVICE)
         with lanes.compiling("always"):
             case.call(*moved(case.inputs, DEVICE))
         wait()
-        return "", known(name, dtype)
+        return "", known(name, dtype), time.perf_counter() - begin
     except Exception as told:
-        return f"{name}: {type(told).__name__}: {told}", b""
+        return f"{name}: {type(told).__name__}: {told}", b"", time.perf_counter() - begin
+
+
+def experiment(name: str) -> tuple[str, bool, str]:
+    """Run an experiment on the device and on the CPU: its name, whether they agree, and what is told."""
+    begin, found = time.perf_counter(), list[dict[str, Any]]()
+    with tempfile.TemporaryDirectory() as folder:
+        started = []
+        for device in (DEVICE, "cpu"):
+            place = f"{folder}/{device}{len(started)}"
+            words = f"-m staf_torch experiment={name} figures=false device={device} hydra.run.dir={place}"
+            command, given = (
+                [sys.executable, *words.split()],
+                dict[str, Any](stderr=subprocess.STDOUT, text=True),
+            )
+            given["env"] = os.environ | {"OMP_NUM_THREADS": "2"}
+            started.append((place, subprocess.Popen(command, stdout=subprocess.PIPE, cwd=folder, **given)))
+        for place, process in started:
+            try:
+                told = process.communicate(
+                    timeout=max(1.0, EXPERIMENT_SECONDS + begin - time.perf_counter())
+                )[0]
+            except subprocess.TimeoutExpired:
+                process.kill()
+                return name, False, f"not ended after {EXPERIMENT_SECONDS} s"
+            if process.returncode:
+                return name, False, told[-600:]
+            found.append(json.loads(Path(place, "metrics.json").read_text()))
+    one, other = (dict(_numbers(each)) for each in found)
+    away = max((abs(one[k] - other[k]) / (1 + abs(other[k])) for k in other if k in one), default=0.0)
+    right = one.keys() == other.keys() and away < ALIKE
+    return name, right, f"{len(other)} metrics, off by {away:.1e}, {time.perf_counter() - begin:.0f} s"
+
+
+def _numbers(tree: Any, at: str = "") -> Iterator[tuple[str, float]]:
+    """Numbers of a tree of JSON, without those that a clock gives."""
+    if isinstance(tree, dict):
+        for key, value in tree.items():
+            if "seconds" not in key and "time" not in key:
+                yield from _numbers(value, f"{at}/{key}")
+    elif isinstance(tree, list):
+        for k, value in enumerate(tree):
+            yield from _numbers(value, f"{at}/{k}")
+    elif isinstance(tree, float | int) and math.isfinite(tree):
+        yield at, float(tree)
 
 
 def known(name: str, dtype: torch.dtype) -> bytes:
     """`truth` of the first rows; in bytes, as another process sends it."""
-    drawn = not name.startswith(("M =", "few rows", "chase"))  # by torch, otherwise where there are more
+    drawn = not name.startswith(
+        ("M =", "few rows", "chase", "Lorenz", "gradient")
+    )  # by torch, otherwise where there are more
     inputs = made(name, dtype, most_of(KINDS[name][1])).inputs if drawn else KINDS[name][0](FEW, dtype).inputs
     held = io.BytesIO()
     torch.save(truth(name, dtype, first(inputs, FEW)), held)
@@ -349,54 +408,6 @@ def same_there(call: Callable[[str], Any]) -> bool:
     return away < 1e-9
 
 
-def of_peers() -> None:
-    """Print the rate of JAX for the same, where it is installed."""
-    sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
-    import numpy as np
-
-    try:
-        import jax
-        import peer_laws
-    except ImportError as told:
-        print(f"no peers: {told}")
-        return
-    measured = ("SteepestDescent", 3, 100), ("ConjugateGradient", 6, 16), ("SteepestDescent", 15, 16)
-    for law, count, times in measured:
-        programs = peer_laws.jax_programs(law, lanes_offsets(count), 10)
-        for dtype in DTYPES:
-            for rows in (100_000, 1_000_000):
-                x, rates = cases.circles(rows, times, dtype).numpy(), [0.0]
-                for kind, (program, last) in programs.items():
-                    if not last and rows > 100_000:
-                        continue
-                    given = jax.device_put(np.ascontiguousarray(x.transpose(1, 2, 0)) if last else x)
-                    try:
-                        rates.append(rows * times / jax_seconds(lambda f=program, x=given: f(x)))
-                    except Exception as told:
-                        print(f"JAX {kind}: {str(told)[:200]}")
-                name = f"M = {count} {law}" + (", 100" if times == 100 else "")
-                ours, best = RATES.get((name, dtype, rows), float("nan")), max(rates)
-                told = f"{best / 1e9:8.3f} G/s; ours {ours / best if best else 0:6.1f} times"
-                print(f"JAX {name:28} {str(dtype)[6:]:8} {rows:8} {told}", flush=True)
-
-
-def jax_seconds(call: Callable[[], Any]) -> float:
-    """The median of the seconds of a call of JAX."""
-    call().block_until_ready()
-    seconds = []
-    for _ in range(3):
-        begin = time.perf_counter()
-        call().block_until_ready()
-        seconds.append(time.perf_counter() - begin)
-    return statistics.median(seconds)
-
-
-def lanes_offsets(count: int) -> Any:
-    import staf_torch as st
-
-    return (st.rings(count) * cases.RADIUS[count]).double().numpy()
-
-
 def registers(only: str) -> int:
     """Compile the kernels with nvcc for several architectures; print their registers and what is spilled."""
     bad = 0
@@ -427,6 +438,7 @@ def main() -> int:
     options.add_argument("--only", default="")
     options.add_argument("--largest", type=int, default=10**9, help="rows")
     options.add_argument("--no-peers", action="store_true")
+    options.add_argument("--seconds", type=float, default=170.0, help="after which nothing more is begun")
     given = options.parse_args()
     if given.ptxas:
         return registers(given.only)
@@ -444,37 +456,64 @@ def main() -> int:
     if not torch.cuda.is_available():
         print("no CUDA device here")
         return 2
+    return on_card(given)
+
+
+def on_card(given: argparse.Namespace) -> int:
+    """Build everything ahead, in as many processes as there are cores, and print the tables."""
     begin = time.perf_counter()
+    until = begin + given.seconds
     warnings.simplefilter("ignore")  # of the profiler
-    wanted = [(name, dtype) for name in KINDS if given.only in name for dtype in DTYPES]
+    names = [name for name in KINDS if given.only in name]
+    wanted = [
+        (name, dtype) for name in sorted(names, key=lambda name: "M = 15" not in name) for dtype in DTYPES
+    ]
     workers = min(len(wanted), max(1, (os.cpu_count() or 1) - 2))
     spawn = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(workers, mp_context=spawn) as pool:
-        told = []
-        for what, (failed, held) in zip(wanted, pool.map(build, *zip(*wanted, strict=True)), strict=True):
-            told += [failed] if failed else []
+    rival: dict[Any, Any] = {}
+    with (
+        concurrent.futures.ThreadPoolExecutor(4) as threads,
+        concurrent.futures.ProcessPoolExecutor(workers, mp_context=spawn) as pool,
+    ):
+        tried = [] if given.only else [threads.submit(experiment, name) for name in EXPERIMENTS]
+        waiting = {what: pool.submit(build, *what) for what in wanted}
+        if not given.no_peers and not given.only:
+            rival = peers.built(threads, given.largest)
+        for what, each in waiting.items():
+            failed, held, seconds = each.result()
             TRUTHS.update({what: held} if held else {})
+            if failed or seconds > SLOW:
+                print(failed or f"{what[0]} {what[1]}: {seconds:.0f} s to build and to know", flush=True)
+        for each in tried:
+            yielded = each.result()
+            RIGHT.append(yielded[1])
+            print(f"experiment={yielded[0]}: {'right' if yielded[1] else 'WRONG'}, {yielded[2]}", flush=True)
+        concurrent.futures.wait(rival.values())
     built = time.perf_counter() - begin
-    print(
-        "\n".join(
-            [*told, f"{torch.cuda.get_device_name()}, torch {torch.__version__}; built in {built:.0f} s"]
-        )
-    )
-    names = [name for name in KINDS if given.only in name]
-    right = [*table(names[:PEERS], given.largest)]
+    print(f"{torch.cuda.get_device_name()}, torch {torch.__version__}; built in {built:.0f} s", flush=True)
+    RIGHT.extend(table(names, given.largest, until))
+    RIGHT.extend(checked())
+    peers.compared(rival, RATES, until)
     if not given.no_peers:
-        of_peers()
-    right += [*checked(), *table(names[PEERS:], given.largest)]
-    print(f"{time.perf_counter() - begin:.0f} s in all; {'all right' if all(right) else 'WRONG'}")
-    return int(not all(right))
+        laws = [name for name in names if name.startswith("M =")]
+        peers.eager(laws, lambda *what: made(*what), RATES, DEVICE, until)
+    print(f"{time.perf_counter() - begin:.0f} s in all; {'all right' if all(RIGHT) else 'WRONG'}")
+    return int(not all(RIGHT))
 
 
-def table(names: Sequence[str], largest: int) -> Iterator[bool]:
-    """Print the table; whether each line is right."""
+SLOW = 20  # seconds of building that are told
+RIGHT: list[bool] = []
+
+
+def table(names: Sequence[str], largest: int, until: float = float("inf")) -> Iterator[bool]:
+    """Print the table, as far as it comes in time; whether each line is right."""
     rates = f"{'call ms':>9} kernel ms {'G/s':>8} {'kernel':>8} other kernels"
     print(f"{'program':28} {'dtype':8} {'rows':>8} {'error':>8} {'bound':>8} first s {rates}")
     for name, dtype in itertools.product(names, DTYPES):
         for rows in sorted({min(rows, largest) for rows in KINDS[name][1]}):
+            if time.perf_counter() > until:
+                print(f"{name:28} {str(dtype)[6:]:8} {rows:8} left out, as the time was over")
+                continue
             yield attempted(f"{name} {dtype} {rows}", functools.partial(compare, name, dtype, rows))
             torch.cuda.empty_cache()
 

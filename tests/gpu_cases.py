@@ -218,6 +218,36 @@ def information(rows: int, dtype: torch.dtype) -> Case:
     return of_loop(learner, plant, cost, x0, 100, dt=1e-3)
 
 
+def random_points(rows: int, dtype: torch.dtype) -> Case:
+    """The same learner as a user calls it: its points are made where it runs, by seed, row and step."""
+    plant, cost = systems.TwoState(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+    following = st.StateFollowingCenters(st.rings(3), st.StateRadius(0.7, 1e-5))
+    basis = adp.StaFValueBasis(st.StaFBasis(st.AnchoredKernel(st.ExponentialKernel()), following))
+    points = adp.RandomPoints(1, st.StateRadius(2.1, 1e-5))
+    learner = adp.ActorCritic(basis, plant, cost, points, adp.Information())
+    x0 = torch.tensor([-1.0, 1.0], dtype=dtype) + 0.1 * torch.randn(rows, 2, dtype=dtype)
+
+    def call(x0: Tensor) -> Any:
+        found = adp.simulate(learner, plant, cost, x0, dt=1e-3, steps=100, every=10)
+        return found.state, found.cost
+
+    return of_function(call, x0, times=100)
+
+
+def lorenz_gradients(rows: int, dtype: torch.dtype) -> Case:
+    """Forwards and backwards, by the first state and rho."""
+    program = lanes.Program(lorenz)
+
+    def call(run: Any, x0: Tensor, rho: Tensor) -> Any:
+        with torch.enable_grad():
+            x, own = x0.clone().requires_grad_(), rho.clone().requires_grad_()
+            end = run(x, (), own, steps=1000)[0]
+            return torch.autograd.grad(end.square().sum(), (x, own))
+
+    calls = functools.partial(call, program), functools.partial(call, program.definition)
+    return Case(*calls, lorenzes(rows, dtype).inputs[::2], 1000)
+
+
 def filtered(rows: int, dtype: torch.dtype) -> Case:
     plant, cost = systems.TwoState(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
     lqr = adp.LQR(plant, cost)

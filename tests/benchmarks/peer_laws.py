@@ -124,6 +124,64 @@ def jax_programs(law: str, offsets: np.ndarray, inner_steps: int) -> dict[str, t
     return {"jit(vmap(scan))": (jax.jit(jax.vmap(scanned)), False), "batch last": (jax.jit(stacked), True)}
 
 
+def jax_apart(law: str, offsets: np.ndarray, inner_steps: int) -> Program:
+    """A scan with every component an array (B,) of its own, all iterations written out: (T, n, B) states.
+
+    Steepest descent and conjugate gradient; returns M arrays (T, B). What XLA makes of it is one kernel or
+    two a time, its numbers in registers.
+    """
+    import jax
+    import jax.numpy as jnp
+
+    jax.config.update("jax_enable_x64", True)
+    core = np.exp(offsets @ offsets.T).tolist()
+
+    def dot(a: Any, b: Any) -> Any:
+        return sum(x * y for x, y in zip(a, b, strict=True))
+
+    def ratio(a: Any, b: Any) -> Any:
+        return jnp.where(b > 0, a / jnp.where(b > 0, b, 1), 0)
+
+    def step(carry: Any, at: Any) -> Any:
+        (a, last), (x, y) = carry, at
+        gain = x * x + y * y
+        places = [(x + p, y + q) for p, q in offsets.tolist()]
+        values = [c * c + 5 * d * d + jnp.tanh(c * d) for c, d in places]
+        scale = [jnp.exp(p * x + q * y) for p, q in offsets.tolist()]
+
+        def product(u: Any) -> Any:
+            scaled = [s * each for s, each in zip(scale, u, strict=True)]
+            return [s * dot(row, scaled) for s, row in zip(scale, core, strict=True)]
+
+        def slope_at(a: Any) -> Any:
+            return [2 * (v - k) for v, k in zip(values, product(a), strict=True)]
+
+        unit = jnp.exp(gain - last)
+        a = [each * unit for each in a]
+        g, p, before = slope_at(a), [jnp.zeros_like(x)] * len(a), jnp.zeros_like(x)
+        for _ in range(inner_steps):
+            if law == "SteepestDescent":
+                image = product(g)
+                twice = ratio(dot(g, g), dot(g, image))
+                a = [each + 0.5 * twice * down for each, down in zip(a, g, strict=True)]
+                g = [down - twice * each for down, each in zip(g, image, strict=True)]
+                continue
+            g = slope_at(a)
+            slope = dot(g, g)
+            p = [down + ratio(slope, before) * each for down, each in zip(g, p, strict=True)]
+            length = 0.5 * ratio(dot(g, p), dot(p, product(p)))
+            a, before = [each + length * along for each, along in zip(a, p, strict=True)], slope
+        weight = jnp.exp(-gain)
+        return (tuple(a), gain), tuple(each * weight for each in a)
+
+    def run(states: Any) -> Any:
+        zero = jnp.zeros(states.shape[2], states.dtype)
+        start = (zero,) * len(offsets), zero
+        return jax.lax.scan(step, start, (states[:, 0], states[:, 1]))[1]
+
+    return jax.jit(run)
+
+
 def numba_program(law: str, offsets: np.ndarray, inner_steps: int) -> Program:
     """Loops over rows, times and iterations: (B, T, n) to (B, T, M)."""
     import numba
