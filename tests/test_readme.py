@@ -88,23 +88,19 @@ def test_blocks_of_a_page_run_one_after_another(
 def test_front_page_is_two_screens() -> None:
     lines = read(README).splitlines()
     assert lines[0].startswith("# ")
-    assert len(lines) <= 160
+    assert len(lines) <= 150
 
 
 def test_versions_are_those_of_the_last_run_of_the_matrix() -> None:
-    """Of the front page, with its date, and of the classifiers: the table of tests/README.md has them."""
+    """Of the front page and of the classifiers: the table of tests/README.md has them."""
     rows = [line for line in read(ROOT / "tests" / "README.md").splitlines() if " passed, " in line]
     tried: dict[str, set[str]] = {
         each: {found for row in rows for found in re.findall(rf"{each} (\d+\.\d+)", row)}
         for each in ("Python", "torch", "Hydra")
     }
     ends = {each: sorted(found, key=lambda v: int(v.partition(".")[2])) for each, found in tried.items()}
-    (line,) = re.findall(r"^Python 3.*?\d{4}-\d\d-\d\d", read(README), re.MULTILINE | re.DOTALL)
-    python, torch, hydra = ends.values()
-    assert line.startswith(f"Python {python[0]} to {python[-1]}, torch {torch[0]} to {torch[-1]}, Hydra ")
-    assert re.findall(r"1\.\d", line.partition("Hydra")[2].partition(":")[0]) == hydra
-    dates = {found for row in rows for found in re.findall(r"\d{4}-\d\d-\d\d", row)}
-    assert line[-10:] in dates
+    python, torch, _ = ends.values()
+    assert f"Python {python[0]} to {python[-1]}, torch {torch[0]} or newer" in read(README)
     about = tomllib.loads(read(ROOT / "pyproject.toml"))["project"]
     named = [c.rpartition(" ")[2] for c in about["classifiers"] if c.startswith("Programming Language")]
     assert named == python
@@ -216,8 +212,8 @@ def jobs(words: list[str]) -> list[list[str]]:
 STAF = {command: name(path) for path in [README, *MANUALS] for command in commands(path, "staf")}
 
 
-def test_the_front_page_has_a_table_of_commands() -> None:
-    assert len(commands(README, "staf")) >= 10
+def test_the_front_page_names_commands() -> None:
+    assert len(commands(README, "staf")) >= 8
 
 
 @pytest.mark.parametrize(
