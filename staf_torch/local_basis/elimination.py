@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -99,8 +99,8 @@ def degrees_of(directions: Tensor) -> Degrees:
     for degree in range(found.degrees[-1] + 1):
         size = found.degrees.count(degree)
         rest = found.functionals[:, taken : taken + size].mT @ homogeneous(points, degree)
-        alpha = exponents(points.shape[-1], degree)[list(_independent(rest, size))]
-        monomials.append(tuple(tuple(row) for row in alpha.tolist()))
+        alpha = _exponents(points.shape[-1], degree)
+        monomials.append(tuple(alpha[k] for k in _independent(rest, size)))
         taken += size
     return Degrees(tuple(monomials), reach)
 
@@ -117,7 +117,7 @@ def functionals_of(points: Tensor, degrees: Degrees) -> Elimination:
         points: u, (..., M, n), as many as the degrees were found for.
         degrees: which monomials.
     """
-    chosen = [row for block in degrees.monomials for row in block]
+    chosen = tuple(row for block in degrees.monomials for row in block)
     q, r = torch.linalg.qr(_monomials(points, chosen))
     diagonal = r.diagonal(dim1=-2, dim2=-1)
     q = torch.where(diagonal.unsqueeze(-2) < 0, -q, q)
@@ -145,15 +145,26 @@ def _independent(matrix: Tensor, count: int) -> tuple[int, ...]:
 
 def homogeneous(directions: Tensor, degree: int) -> Tensor:
     """u_i^alpha sqrt(k! / alpha!) for all |alpha| = k, so that rows have the norm |u_i|^k: (..., M, C)."""
-    return _monomials(directions, exponents(directions.shape[-1], degree).tolist())
+    return _monomials(directions, _exponents(directions.shape[-1], degree))
 
 
-def _monomials(points: Tensor, alpha: Sequence[Sequence[int]]) -> Tensor:
-    """u_i^alpha sqrt(k! / alpha!), k = |alpha|: (..., M, n) -> (..., M, C)."""
+@functools.lru_cache(maxsize=256)
+def _exponents(dim: int, degree: int) -> tuple[tuple[int, ...], ...]:
+    """Return `exponents` as numbers."""
+    return tuple(map(tuple, exponents(dim, degree).tolist()))
+
+
+@functools.lru_cache(maxsize=256)
+def _scales(alpha: tuple[tuple[int, ...], ...]) -> tuple[float, ...]:
+    """sqrt(k! / alpha!), k = |alpha|, of each."""
     factorials = [math.prod([math.factorial(a) for a in row]) for row in alpha]
-    norm = [math.sqrt(math.factorial(sum(row)) / alike) for row, alike in zip(alpha, factorials, strict=True)]
+    return tuple(math.sqrt(math.factorial(sum(row)) / x) for row, x in zip(alpha, factorials, strict=True))
+
+
+def _monomials(points: Tensor, alpha: tuple[tuple[int, ...], ...]) -> Tensor:
+    """u_i^alpha sqrt(k! / alpha!), k = |alpha|: (..., M, n) -> (..., M, C)."""
     table = _powers(points, max([sum(row) for row in alpha]))
-    monomials = torch.tensor(norm, dtype=points.dtype, device=points.device)
+    monomials = torch.tensor(_scales(alpha), dtype=points.dtype, device=points.device)
     for axis in range(points.shape[-1]):
         monomials = monomials * table[..., axis, [row[axis] for row in alpha]]
     return monomials

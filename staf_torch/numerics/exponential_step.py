@@ -15,11 +15,11 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, bmm
 from torch.nn.functional import pad
 
 from ..lanes import scan
-from ..lanes.row_decisions import in_any_row
+from ..lanes.row_decisions import in_any_row, is_of_rows
 from .default_device import designed_on_cpu
 from .linalg import exponential
 
@@ -62,10 +62,11 @@ def quadratic_integral(matrix: Tensor, rate: Tensor, length: float) -> tuple[Ten
     step = exponential(h * torch.cat(rows)).unsqueeze(0)  # products of one and of many have the same bits
     flow = step[:, n:, n:]
     paid = flow.mT @ step[:, :n, n:]
-    done = 0
-    while in_any_row(doublings > done):
-        paid = torch.where(doublings > done, paid + flow.mT @ paid @ flow, paid)
-        flow = torch.where(doublings > done, flow @ flow, flow)
+    done, several = 0, is_of_rows(doublings)
+    while in_any_row(more := doublings > done):
+        longer, further = paid + bmm(bmm(flow.mT, paid), flow), bmm(flow, flow)
+        paid = torch.where(more, longer, paid) if several else longer
+        flow = torch.where(more, further, flow) if several else further
         done += 1
     return flow[0], 0.5 * (paid + paid.mT)[0]
 

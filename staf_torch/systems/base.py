@@ -14,6 +14,7 @@ from ..lanes.row_objects import OfRows
 from ..numerics.angles import wrap
 from ..numerics.checks import trailing
 from ..numerics.default_device import device_of
+from ..numerics.linalg import point_jacobian
 from ..numerics.shown import limits, settings, sizes
 from .bounds import Bounds
 
@@ -233,9 +234,9 @@ class ControlAffineSystem(Plant):
         """A = d(f + g u)/dx and B = g at rest, by automatic differentiation."""
         at = value_of(self.equilibrium() if x is None else x)
         resting = self.resting_input() if u is None else u
-        matrix = torch.func.jacrev(self.smooth_drift)(at)
+        matrix = point_jacobian(self.smooth_drift, at, len(at))
         g = self.effectiveness(at).detach()
         if in_any_row(resting != 0):
-            pushed = torch.func.jacrev(self.effectiveness)(at)  # (n, m, n)
+            pushed = point_jacobian(self.effectiveness, at, g.numel())  # (n, m, n)
             matrix = matrix + (pushed * resting.to(at)[:, None]).sum(-2)
-        return Linearisation(matrix.detach(), g)
+        return Linearisation(matrix, g)

@@ -37,13 +37,14 @@ class Linear(ControlAffineSystem):
         input_matrix: Sequence[Sequence[float]] | Tensor | None = None,
     ) -> None:
         super().__init__()
-        self.matrix = hold(self, "matrix", _stack("matrix", matrix, "must be (n, n)"))
-        self.dim = len(self.matrix)
-        inputs = [[]] * self.dim if input_matrix is None else input_matrix
-        self.input_matrix = hold(self, "input_matrix", _stack("input_matrix", inputs, "must be (n, m)"))
-        if len(self.input_matrix) != self.dim:
-            raise fail("Linear", "input_matrix", f"must have {self.dim} rows, one a state", input_matrix)
-        self.inputs = self.input_matrix.shape[1]
+        size = len(hold(self, "matrix", _stack("matrix", matrix, "must be (n, n)")))
+        given = [[]] * size if input_matrix is None else input_matrix
+        rows, inputs = hold(self, "input_matrix", _stack("input_matrix", given, "must be (n, m)")).shape
+        if rows != size:
+            raise fail("Linear", "input_matrix", f"must have {size} rows, one a state", input_matrix)
+        self.dim, self.inputs = size, inputs
+        self.matrix: Tensor
+        self.input_matrix: Tensor
 
     def drift(self, x: Tensor) -> Tensor:
         return states(self, "x", x, self.dim) @ self.matrix.to(x).mT

@@ -224,8 +224,8 @@ class LQR(nn.Module, metaclass=OfRows):
             k = (self.cost.r_inverse.to(p).unsqueeze(0) @ b.to(p).mT @ p)[0]
         else:
             p, k = held_riccati(system, still, self.period)
-        clock = self.cost.dim - len(p)
-        p, k = pad(p, (0, clock, 0, clock)), pad(k, (0, clock))
+        if clock := self.cost.dim - len(p):
+            p, k = pad(p, (0, clock, 0, clock)), pad(k, (0, clock))
         self.register_buffer("p", p)
         self.register_buffer("k", k)
         self.p: Tensor

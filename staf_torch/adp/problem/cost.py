@@ -123,8 +123,10 @@ class Cost(nn.Module, metaclass=OfRows):
         self.end: Tensor | None  # S
         self.periodic: tuple[int, ...] = ()
         self._periods: tuple[float, ...] = ()  # of the outputs
-        bounds = Bounds(low, high, inputs).on(device)
-        self.bounds: Bounds | None = bounds if bounds.present else None
+        self.bounds: Bounds | None = None
+        if low is not None or high is not None:
+            bounds = Bounds(low, high, inputs).on(device)
+            self.bounds = bounds if bounds.present else None
         self._prepare()
 
     @by_rows
@@ -157,7 +159,8 @@ class Cost(nn.Module, metaclass=OfRows):
             u = torch.where(torch.isfinite(u).all(), u, plant.resting_input())
         placed = copied(self)
         # An origin that the plant does not take by itself is kept: `around` may be asked again.
-        placed.target = x if in_any_row((x != 0).any() | (plant.equilibrium() != 0).any()) else None
+        stated = self.target is not None and in_any_row(plant.equilibrium() != 0)
+        placed.target = x if stated or in_any_row(x != 0) else None
         placed.target_input = u if in_any_row(u != 0) else None
         placed.periodic = plant.periodic
         if self.output is not None and self.periodic != plant.periodic:

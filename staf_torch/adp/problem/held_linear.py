@@ -90,7 +90,12 @@ def linear_hold(plant: Plant, cost: Cost, period: float) -> Hold:
     Raises:
         ValueError: if the period breaks its rule.
     """
-    f, g = (t.double() for t in plant.linearisation(cost.target, cost.target_input))
+    return _linear_hold(plant, cost, period, *plant.linearisation(cost.target, cost.target_input))
+
+
+def _linear_hold(plant: Plant, cost: Cost, period: float, f: Tensor, g: Tensor) -> Hold:
+    """Return `linear_hold` of a plant that has been linearised."""
+    f, g = f.double(), g.double()
     q, r = (t.to(f) for t in (cost.state_curvature(), cost.r))
     if plant.period is None:
         return exact_hold(f, g, q, r, period, discount=cost.discount)
@@ -117,9 +122,9 @@ def held_riccati(plant: Plant, cost: Cost, period: float) -> tuple[Tensor, Tenso
             mode that does not decay, or SciPy is missing.
     """
     name = type(plant).__name__
-    hold = linear_hold(plant, cost, period)
-    n = len(hold.a)
     f, g = plant.linearisation(cost.target, cost.target_input)
+    hold = _linear_hold(plant, cost, period, f, g)
+    n = len(hold.a)
     rest = math.exp(-0.5 * cost.discount * plant.period) if plant.period is not None else 1.0
     if plant.period is None:
         f = f - 0.5 * cost.discount * torch.eye(n, dtype=f.dtype, device=f.device)
