@@ -57,6 +57,7 @@ _REQUIRES, _VERSION = operator.attrgetter("requires_grad"), operator.attrgetter(
 _BASE, _ARRAY = operator.itemgetter(*_READ), operator.methodcaller("tobytes")
 BOUND = "_compiled_methods"
 """Attribute in which an object holds its compiled methods: no part of what it is."""
+_UNREAD, _HOOKS = IDLE | {BOUND}, ("_forward_hooks", "_forward_pre_hooks")
 
 
 @functools.lru_cache(maxsize=4096)
@@ -100,6 +101,7 @@ class Contents:
     Args:
         objects: modules, tensors, functions, anything that can be pickled.
         telling: whether floats of the library's objects count as tensors.
+        watched: whether `unchanged` and `renewed` will be asked for.
 
     Attributes:
         key: of the settings inside; None where something cannot be written down (an open file, a lock).
@@ -109,7 +111,7 @@ class Contents:
         told: objects by their addresses, and tensors by the names of the floats that they stand for.
     """
 
-    def __init__(self, *objects: Any, telling: bool = False) -> None:
+    def __init__(self, *objects: Any, telling: bool = False, watched: bool = True) -> None:
         walk = self._walk = Walk(io.BytesIO(), telling)
         self.key: tuple[bytes, tuple[object, ...]] | None = None
         try:
@@ -122,10 +124,15 @@ class Contents:
             self.reason = f"{type(error).__name__}: {error}"
         self.tensors, self.of_users = walk.tensors, walk.of_users or self.key is None
         self.told = walk.told
-        kinds = (kind for each in walk.kept if isinstance(each, type) for kind in each.__mro__)
-        classes = [kind for kind in dict.fromkeys(kinds) if kind is not object]
-        self._users = [vars(kind) for kind in classes if is_users(kind)]
-        self._library = [vars(kind) for kind in classes if not is_users(kind)]
+        kinds = chain.from_iterable([each.__mro__ for each in walk.kept if isinstance(each, type)])
+        classes = [(vars(kind), is_users(kind)) for kind in dict.fromkeys(kinds) if kind is not object]
+        self._users = [space for space, users in classes if users]
+        self._library = [space for space, users in classes if not users]
+        if watched:
+            self._watch(walk)
+
+    def _watch(self, walk: Walk) -> None:
+        """Note how all that was come upon is now."""
         found = [*map(all_rows, walk.tensors), *walk.others]
         self._changeable = [tensor for tensor in found if not tensor.is_inference()]
         self._structural = [(tensor, tensor._version) for tensor in walk.others if not tensor.is_inference()]
@@ -191,8 +198,8 @@ class Contents:
 
     def replaced(self, methods: list[Any]) -> bool:
         """Return whether a method of the library's is not what it was among ``methods``."""
-        now = self.methods()
-        return len(now) != len(methods) or not all(map(is_, now, methods))
+        now = chain.from_iterable([part.values() for part in self._library])
+        return sum(map(len, self._library)) != len(methods) or not all(map(is_, now, methods))
 
     def signature(self) -> bytes | None:
         """Return the key as bytes that mean the same in every process.
@@ -248,6 +255,17 @@ def number(place: int, value: float) -> Tensor:
     Two places never share one: a text would then know that their numbers are equal.
     """
     return torch.tensor(value, dtype=torch.float64, device="cpu")
+
+
+class _Names(dict[torch.dtype, str]):
+    """Names of dtypes, which torch spells anew each time."""
+
+    def __missing__(self, dtype: torch.dtype) -> str:
+        self[dtype] = name = str(dtype)
+        return name
+
+
+_NAMES = _Names()
 
 
 class _Same:
@@ -323,16 +341,18 @@ class Walk(pickle.Pickler):
             kind: Any = type(value)  # which has a hash
             if _is_layer(kind):
                 self.layers.update(map(id, value._parameters.values()))
-            state = {k: v for k, v in value.__getstate__().items() if k not in IDLE and k != BOUND}
-            # The keys of hooks count all hooks of the process.
-            hooks = {k: tuple(v.values()) for k, v in state.items() if k.endswith("_hooks") and v}
-            self.dicts += [state[k] for k in hooks]
-            state |= hooks
+            held = vars(value)
+            plain = kind.__getstate__ is object.__getstate__ and not kind.__dict__.get("__slotnames__", True)
+            whole = held if plain else value.__getstate__()
+            state = {k: v for k, v in whole.items() if k not in _UNREAD}
+            for hooks in _HOOKS:  # whose keys count all hooks of the process
+                if state.get(hooks):
+                    self.dicts.append(state[hooks])
+                    state[hooks] = tuple(state[hooks].values())
             if self._telling:
                 self._tell(value, state)
             self._states[id(state)] = state
-            own = [k for k in vars(value) if k in state and k not in _OF_EVERY_MODULE]
-            self.modules.append((vars(value), own))
+            self.modules.append((held, [k for k in held if k in state and k not in _OF_EVERY_MODULE]))
             return copyreg.__newobj__, (type(value),), state  # type: ignore[attr-defined]
         held = getattr(value, "__dict__", ())
         if BOUND in held or (held and self._telling and getattr(type(value), "told", ())):
@@ -415,7 +435,8 @@ class Walk(pickle.Pickler):
             self.tensors.append(value)
         place = self._places[id(value)]
         own = isinstance(value, RowNumbers)  # how many rows there are is no matter
-        return place, own, str(value.dtype), str(value.device), tuple(value.shape), value.stride()
+        where = "cpu" if value.is_cpu else str(value.device)
+        return place, own, _NAMES[value.dtype], where, tuple(value.shape), value.stride()
 
     def _note(self, value: Any) -> None:
         """Note what may change inside of an object; a module is noted in `reducer_override`."""

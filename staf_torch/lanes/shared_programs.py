@@ -81,9 +81,9 @@ class SharedPrograms:
             make: the step of ``parts``, all of which come to it by these arguments: floats of the library's
                 objects among them are then numbers of the table, too.
         """
-        read = Contents(copies, *parts, telling=make is not None)
+        read = Contents(copies, *parts, telling=make is not None, watched=False)
         if read.told and read.key not in self._models and not leads_by_copies(read, parts):
-            read = Contents(copies, *parts)
+            read = Contents(copies, *parts, watched=False)
         if read.key is None:
             if not self._warned:
                 self._warned = True

@@ -24,6 +24,7 @@ _SETTLED = 1e-17  # relative, of what a doubling adds
 _LYAPUNOV = 1e-9  # likewise, of a correction
 _BESIDE = 1.25  # a shift of the spectrum's geometric middle would meet an eigenvalue more often
 _SOLVED = 1e-9  # residual over the largest of its terms: P is no solution above
+_Terms = tuple[Tensor, Tensor, tuple[Tensor, ...]]  # closed loop, residual, what it is the sum of
 
 
 def continuous_solution(a: Tensor, b: Tensor, q: Tensor, r: Tensor) -> Tensor:
@@ -45,10 +46,10 @@ def continuous_solution(a: Tensor, b: Tensor, q: Tensor, r: Tensor) -> Tensor:
     start = 2 * shift * (shifted @ g @ whole.mT), 2 * shift * (whole.mT @ h @ shifted)
     p = scale * _doubled(eye + 2 * shift * whole, *(0.5 * (each + each.mT) for each in start))
 
-    def terms(p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def terms(p: Tensor) -> _Terms:
         seen = p @ b
         paid, left = seen @ _solve(r, seen.mT), a.mT @ p
-        return a - b @ _solve(r, seen.mT), left + left.mT - paid + q, _norm(left) + _norm(paid) + _norm(q)
+        return a - b @ _solve(r, seen.mT), left + left.mT - paid + q, (left, paid, q)
 
     def correction(closed: Tensor, residual: Tensor) -> Tensor:
         inverse = _inverse(closed - shift * eye)
@@ -67,14 +68,14 @@ def discrete_solution(a: Tensor, b: Tensor, q: Tensor, s: Tensor, r: Tensor) -> 
     free, g, h = a - bmm(b, cross), bmm(b, _solve(r, b.mT)), q - bmm(s, cross)
     p = _doubled(free, *(0.5 * (each + each.mT) for each in (g, h)))
 
-    def terms(p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def terms(p: Tensor) -> _Terms:
         seen = bmm(b.mT, p)
         gain = _solve(r + bmm(seen, b), bmm(seen, a) + s.mT)
         closed, cross = a - bmm(b, gain), bmm(s, gain)
         # Of what the gain pays (Joseph's form): A'PA would be much larger than what is left of it.
         paid = q - cross - cross.mT + bmm(bmm(gain.mT, r), gain)
         left = bmm(bmm(closed.mT, p), closed)
-        return closed, 0.5 * (left + left.mT) + (paid - p), _norm(left) + _norm(p)
+        return closed, 0.5 * (left + left.mT) + (paid - p), (left, p)
 
     return _refined(p, terms, _summed, lambda modes: modes.abs() < 1)[0]
 
@@ -114,7 +115,7 @@ def _summed(closed: Tensor, added: Tensor) -> Tensor:
 
 def _refined(
     p: Tensor,
-    terms: Callable[[Tensor], tuple[Tensor, Tensor, Tensor]],
+    terms: Callable[[Tensor], _Terms],
     correction: Callable[[Tensor, Tensor], Tensor],
     decays: Callable[[Tensor], Tensor],
 ) -> Tensor:
@@ -122,23 +123,24 @@ def _refined(
 
     Args:
         p: (1, n, n).
-        terms: closed loop, residual and the size of its terms, at P.
+        terms: closed loop, residual and its terms, at P.
         correction: of P, for a closed loop and a residual.
         decays: which eigenvalues of the closed loop do.
     """
     going, before = _Going(), torch.full_like(p[..., :1, :1], torch.inf)
     for _ in range(_NEWTON):
-        closed, residual, size = terms(p)
+        closed, residual, parts = terms(p)
         step = correction(closed, residual)
         change = _norm(step)
         if not going.on(change < 0.5 * before):
             break
         p, before = going.of(p + step, p), change
         if not going.on(change > torch.finfo(p.dtype).eps * _norm(p)):
-            closed, residual, size = terms(p)
+            closed, residual, parts = terms(p)
             break
     else:
-        closed, residual, size = terms(p)
+        closed, residual, parts = terms(p)
+    size = sum(map(_norm, parts), torch.zeros_like(before))
     fine = torch.isfinite(p).all(-1).all(-1) & torch.isfinite(closed).all(-1).all(-1)
     modes = torch.linalg.eigvals(torch.where(fine[..., None, None], closed, torch.zeros_like(closed)))
     solved = fine & decays(modes).all(-1) & (_norm(residual) <= _SOLVED * size)[..., 0, 0]
@@ -155,7 +157,9 @@ class _Going:
     def on(self, further: Tensor) -> bool:
         """Return whether any row goes on: (..., 1, 1), which of those that did before do."""
         self._several = is_of_rows(further)
-        self._rows = self._rows & further if self._several and self._rows is not None else further
+        if not self._several:
+            return bool(further)
+        self._rows = further if self._rows is None else self._rows & further
         return in_any_row(self._rows)
 
     def of(self, new: Tensor, old: Tensor) -> Tensor:
@@ -165,7 +169,8 @@ class _Going:
 
 def _norm(matrix: Tensor) -> Tensor:
     """The largest sum of a row's sizes, (..., 1, 1)."""
-    return torch.linalg.matrix_norm(matrix, torch.inf, keepdim=True)
+    largest: Tensor = torch.linalg.matrix_norm(matrix, torch.inf, keepdim=True)
+    return largest
 
 
 def _solve(matrix: Tensor, right: Tensor) -> Tensor:

@@ -14,6 +14,7 @@ from torch.nn.functional import pad
 
 from ...lanes.gradients import without_gradient
 from ...lanes.one_thread import small
+from ...lanes.row_numbers import nonzero
 from ...numerics.checks import fail, positive_real
 from ...numerics.default_device import designed_on_cpu
 from ...numerics.differences import STEP, central_slopes
@@ -57,7 +58,8 @@ def exact_hold(f: Tensor, g: Tensor, q: Tensor, r: Tensor, period: float, *, dis
     positive_real("exact_hold", "period", period)
     n, m = g.shape
     whole = pad(torch.cat((f, g), dim=1).double(), (0, 0, 0, m))
-    whole = whole - 0.5 * discount * torch.eye(n + m, dtype=torch.float64, device="cpu")
+    if nonzero(discount):
+        whole = whole - 0.5 * discount * torch.eye(n + m, dtype=torch.float64, device="cpu")
     rate = torch.block_diag(q.double(), r.double())
     flow, paid = quadratic_integral(whole, rate, period)
     return Hold(flow[:n, :n], flow[:n, n:], paid)
@@ -126,7 +128,7 @@ def held_riccati(plant: Plant, cost: Cost, period: float) -> tuple[Tensor, Tenso
     hold = _linear_hold(plant, cost, period, f, g)
     n = len(hold.a)
     rest = math.exp(-0.5 * cost.discount * plant.period) if plant.period is not None else 1.0
-    if plant.period is None:
+    if plant.period is None and nonzero(cost.discount):
         f = f - 0.5 * cost.discount * torch.eye(n, dtype=f.dtype, device=f.device)
     check_modes(
         rest * f.double(),
