@@ -341,9 +341,9 @@ class Walk(pickle.Pickler):
             kind: Any = type(value)  # which has a hash
             if _is_layer(kind):
                 self.layers.update(map(id, value._parameters.values()))
-            held = vars(value)
+            attributes = vars(value)
             plain = kind.__getstate__ is object.__getstate__ and not kind.__dict__.get("__slotnames__", True)
-            whole = held if plain else value.__getstate__()
+            whole = attributes if plain else value.__getstate__()
             state = {k: v for k, v in whole.items() if k not in _UNREAD}
             for hooks in _HOOKS:  # whose keys count all hooks of the process
                 if state.get(hooks):
@@ -352,7 +352,9 @@ class Walk(pickle.Pickler):
             if self._telling:
                 self._tell(value, state)
             self._states[id(state)] = state
-            self.modules.append((held, [k for k in held if k in state and k not in _OF_EVERY_MODULE]))
+            self.modules.append(
+                (attributes, [k for k in attributes if k in state and k not in _OF_EVERY_MODULE])
+            )
             return copyreg.__newobj__, (type(value),), state  # type: ignore[attr-defined]
         held = getattr(value, "__dict__", ())
         if BOUND in held or (held and self._telling and getattr(type(value), "told", ())):
