@@ -50,7 +50,7 @@ def repeat(
             once no row goes on, no pass is computed. What ``body`` reads from outside of the carry is found
             before the first pass, whoever takes it.
     """
-    if (count > 1 or (where is not None and count)) and (tracer := _tracer(carry)) is not None:
+    if (count > 1 or (where is not None and count)) and (tracer := tracer_of(carry)) is not None:
         return _loop(tracer, count, lambda now, _: (body(now), ()), carry, (), 1, where)[0]
     for _ in range(_passes(count)):
         if where is None:
@@ -106,7 +106,7 @@ def where_rows(where: Tensor, body: Callable[[Tree], Some], given: Tree, otherwi
         given: a tree of tensors (B, ...): all that ``body`` reads of a row.
         otherwise: a tree of tensors (B, ...), as ``body`` returns it.
     """
-    if _tracer((given, otherwise)) is not None:
+    if tracer_of((given, otherwise)) is not None:
         start = otherwise, given
         chosen: Some = repeat(1, lambda now: (body(now[1]), now[1]), start, where=lambda _: where)[0]
         return chosen
@@ -153,7 +153,7 @@ def scan(
     """
     leaves, structure = flatten(inputs)
     count = leaves[0].shape[dim]
-    tracer = None if unrolled or count < 2 else _tracer((carry, inputs))
+    tracer = None if unrolled or count < 2 else tracer_of((carry, inputs))
     if tracer is not None:
         first = unflatten(structure, iter([leaf.select(dim, 0) for leaf in leaves]))
         if not _fixed(tracer, (carry, inputs), lambda: body(carry, first)):
@@ -195,7 +195,7 @@ def reduce(
     """
     leaves, structure = flatten(points)
     count = leaves[0].shape[dim]
-    if count > 1 and (tracer := _tracer(points)) is not None:
+    if count > 1 and (tracer := tracer_of(points)) is not None:
         begin = unflatten(structure, iter([leaf.narrow(dim, 0, 1) for leaf in leaves]))
         first = _reduced(body(begin), operation, dim)
 
@@ -230,7 +230,7 @@ def each(body: Callable[[Tensor], Tensor], points: Tensor, *, dim: int = 1, toge
         together: points at a time.
     """
     count = points.shape[dim]
-    if count <= together or (tracer := _tracer(points)) is None:
+    if count <= together or (tracer := tracer_of(points)) is None:
         return body(points)
     passes = -(-count // together)
     more = passes * together - count
@@ -307,7 +307,7 @@ def traced_as(spelling: Callable[..., Some]) -> Callable[[Callable[..., Some]], 
     return decorated
 
 
-def _tracer(tree: Tree) -> Tracer | None:
+def tracer_of(tree: Tree) -> Tracer | None:
     """Who traces the program now; None where nobody does, or a derivative is taken through the loop."""
     tracer: Tracer | None = getattr(_active, "tracer", None)
     if tracer is None or torch._C._functorch.peek_interpreter_stack() is not None:

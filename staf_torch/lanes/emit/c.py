@@ -9,8 +9,8 @@ from typing import ClassVar, NamedTuple
 
 from ..trace.graph import FLAG, NARROW, REAL, ROW, STEP, WHOLE, WIDE, Graph
 from .identifiers import checked_names, guarded
+from .matrices import MatrixWriter
 from .schedule import Schedule, Sizes
-from .statements import StatementWriter
 
 _NAMES = {"abs": "fabs", "round": "rint"}
 
@@ -59,11 +59,11 @@ _PHILOX = """%(how)s %(real)s %(name)s(%(given)s)
 """
 
 
-class ScalarWriter(StatementWriter):
+class ScalarWriter(MatrixWriter):
     """What C and CUDA C have in common: every number is a variable of its own."""
 
-    _infix: ClassVar[dict[str, str]] = StatementWriter._infix | {"and": "&&", "or": "||", "xor": "!="}
-    _prefix: ClassVar[dict[str, str]] = StatementWriter._prefix | {"not": "!"}
+    _infix: ClassVar[dict[str, str]] = MatrixWriter._infix | {"and": "&&", "or": "||", "xor": "!="}
+    _prefix: ClassVar[dict[str, str]] = MatrixWriter._prefix | {"not": "!"}
 
     def __init__(self, graph: Graph, schedule: Schedule, layout: Sizes, names: Names) -> None:
         self.real, self._suffix = ("float", "f") if graph.single else ("double", "")
@@ -89,6 +89,9 @@ class ScalarWriter(StatementWriter):
 
     def _fma(self, a: str, b: str, c: str) -> str:
         return f"{a} * {b} - {c[1:]}" if c.startswith("-") else f"{a} * {b} + {c}"
+
+    def _stated(self, value: float, type: str) -> str:
+        return self._number(value, type)
 
     def _literal(self, node: int) -> str:
         value = self.graph.value(node)

@@ -73,7 +73,9 @@ def _work(graph: Graph, schedule: Schedule) -> dict[str, int]:
         op, count = graph.op[node], graph.size(node)
         if op in _FREE:
             continue
-        if op in ("map", "dot"):
+        if op == "tridiagonal":
+            count, op = graph.aux[node][1][0] ** 3, "add"
+        elif op in ("map", "dot"):
             count *= graph.aux[node][1] if op == "dot" else 1
             op = "add" if op == "dot" else graph.aux[node][0]
         count *= schedule.repeats(node, skipped=8) * (_COSTLY if op in _FUNCTIONS else 1)
@@ -302,6 +304,9 @@ class _CppWriter(TableWriter):
 
     def _number(self, node: int, text: str) -> str:
         return f"number({text})" if self.graph.type[node] == FLAG else text
+
+    def _stated(self, value: float, type: str) -> str:
+        return f"splat(REAL({value!r}))"
 
     def _literal(self, node: int) -> str:
         if self.graph.op[node] == "param":

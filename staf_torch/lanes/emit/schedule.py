@@ -235,7 +235,7 @@ def taken_over(graph: Graph, schedule: Schedule) -> set[int]:
             counts[argument] += 1
     found, length = set[int](), dict[int, int]()
     for node in sorted(schedule.live):
-        if graph.op[node] != "map":
+        if graph.op[node] not in ("map", "tridiagonal"):
             continue
         length[node] = 1
         sizes = [s for s in graph.aux[node][1] if s > 1]
@@ -251,9 +251,12 @@ def taken_over(graph: Graph, schedule: Schedule) -> set[int]:
             if 8 * len(entries) > 10 * len(set(entries)) or length[node] + more > _LONGEST:
                 continue
             inside = [places for read in reads for _, places in leaves(graph, found, argument, read)]
-            if all(evenly(places, sizes) is not None for places in inside):
+            anyhow = graph.op[node] == "tridiagonal"  # looks up places where they are irregular
+            if anyhow or all(evenly(places, sizes) is not None for places in inside):
                 found.add(argument)
                 length[node] += more
+        if graph.op[node] == "tridiagonal":  # reads as a map does, and is computed where it stands
+            del length[node]
     return found
 
 

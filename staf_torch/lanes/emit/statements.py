@@ -48,7 +48,7 @@ def runs(places: Sequence[tuple[Hashable, int]]) -> list[EvenRun]:
 
 _INPUTS = ("const", "param", "elem", "result", "results", "collect", "carry", "carrys", "state", "row", "now")
 _INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/", "lt": "<", "le": "<=", "eq": "==", "ne": "!="}
-_ARRAYS = ("pack", "map", "dot", "collect", "carrys", "results")
+_ARRAYS = ("pack", "map", "dot", "tridiagonal", "collect", "carrys", "results")
 
 
 class StatementWriter(abc.ABC):
@@ -107,6 +107,10 @@ class StatementWriter(abc.ABC):
     @abc.abstractmethod
     def _literal(self, node: int) -> str:
         """The expression of a constant."""
+
+    @abc.abstractmethod
+    def _stated(self, value: float, type: str) -> str:
+        """The expression of a number that a writer knows."""
 
     @abc.abstractmethod
     def _buffer(self, op: str, place: int, j: int, at: str = "0") -> str:
@@ -168,7 +172,7 @@ class StatementWriter(abc.ABC):
                 continue
             if op == "loop":
                 self._loop(self.graph.aux[node])
-            elif op in ("pack", "map", "dot"):
+            elif op in ("pack", "map", "dot", "tridiagonal"):
                 getattr(self, f"_{op}")(node)
             else:
                 for j in range(self.copies):

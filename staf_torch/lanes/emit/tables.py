@@ -11,8 +11,8 @@ from torch import Tensor
 
 from ..trace.graph import Graph
 from ..trace.tracer import LARGE
+from .matrices import MatrixWriter
 from .schedule import Schedule, Sizes, ends_with, taken_over
-from .statements import StatementWriter
 
 
 class Text(NamedTuple):
@@ -31,7 +31,7 @@ class Text(NamedTuple):
         return table.to(real)
 
 
-class TableWriter(StatementWriter):
+class TableWriter(MatrixWriter):
     """A writer of programs that run for many rows and times.
 
     Attributes:

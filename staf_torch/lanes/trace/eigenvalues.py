@@ -10,11 +10,14 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
+from torch.utils._python_dispatch import _disable_current_modes
 
-from ..loops import repeat
+from ..loops import repeat, tracer_of
 from .factorisations import in_memory
+from .graph import NARROW, REAL
 
 
 def eigen(gram: Tensor, UPLO: str = "L", compute_v: bool = True) -> tuple[Tensor, Tensor]:
@@ -80,10 +83,11 @@ def eigenvalues(gram: Tensor) -> Tensor:
 
     Source: Barth, Martin and Wilkinson, Numerische Mathematik 9 (1967).
     """
-    largest = gram.abs().amax((-2, -1), keepdim=True)
-    largest = torch.where(largest > 0, largest, 1.0)  # squares of entries shall neither overflow nor vanish
-    find = _rolled_tridiagonal if in_memory(gram) else _tridiagonal
-    diagonal, squares = find(gram / largest)
+    if in_memory(gram):
+        diagonal, squares, largest = _in_memory(gram)
+    else:
+        largest = _largest(gram)
+        diagonal, squares = _tridiagonal(gram / largest)
     size, real = len(diagonal), torch.finfo(gram.dtype)
     beside = [square.sqrt() for square in squares]
     zero = torch.zeros_like(diagonal[0])
@@ -141,27 +145,30 @@ def _turn(matrix: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
     return c * matrix + s * matrix[..., partner, :]
 
 
-def _rolled_tridiagonal(gram: Tensor) -> tuple[list[Tensor], list[Tensor]]:
-    """The diagonal of Q'KQ, M of (...), and the squares of the entries beside it, M - 1 of (...)."""
-    size = gram.shape[-1]
+def _in_memory(gram: Tensor) -> tuple[list[Tensor], list[Tensor], Tensor]:
+    """As `_tridiagonal`, of a matrix over its largest entry, and that: a program has an operation for it.
 
-    def reflect(carry: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-        matrix, diagonal, squares = carry  # what is done lies in zeros at the end
-        column, rest = matrix[..., 1:, 0], matrix[..., 1:, 1:]
-        square = column.square().sum(-1, keepdim=True)
-        root = square.sqrt()
-        head = torch.where(column[..., :1] < 0, column[..., :1] - root, column[..., :1] + root)
-        vector = torch.cat((head, column[..., 1:]), dim=-1)
-        length = vector.square().sum(-1, keepdim=True)
-        factor = torch.where(length > 0, 2 / torch.where(length > 0, length, 1.0), 0.0)
-        image = factor * (rest * vector.unsqueeze(-2)).sum(-1)
-        image = image - 0.5 * factor * (image * vector).sum(-1, keepdim=True) * vector
-        both = vector.unsqueeze(-1) * image.unsqueeze(-2)
-        diagonal = torch.cat((diagonal[..., 1:], matrix[..., 0, :1]), dim=-1)
-        squares = torch.cat((squares[..., 1:], square), dim=-1)
-        return torch.constant_pad_nd(rest - both - both.mT, [0, 1, 0, 1]), diagonal, squares
+    It stays below the diagonal of one triangle in memory, of which the text of a loop reads and writes a
+    quarter of what passes over whole matrices do.
+    """
+    largest = _largest(gram)
+    with _disable_current_modes():
+        diagonal, squares = _tridiagonal(gram.detach() / largest.detach())
+        values = torch.stack([*diagonal, *squares, largest.detach()[..., 0, 0]], dim=-1)
+    tracer = tracer_of(gram)
+    if tracer is None or not tracer.traced(gram):
+        diagonal, squares = _tridiagonal(gram / largest)
+        return diagonal, squares, largest
+    kind, size = tracer.kind(gram.dtype), gram.shape[-1]
+    held = REAL if kind == NARROW else kind
+    nodes = tracer.nodes(gram, held)
+    every = [tracer.tridiagonal(each, size, held) for each in nodes.reshape(-1, size * size)]
+    found = tracer.cast(np.stack(every).reshape(values.shape), kind)
+    *parts, last = tracer.attach(values, found).unbind(-1)
+    return parts[:size], parts[size:], last[..., None, None]
 
-    zero = torch.zeros_like(gram[..., 0, : size - 2])
-    rest, diagonal, squares = repeat(size - 2, reflect, (gram.clone(), zero, zero.clone()))
-    last = [rest[..., 0, 0], rest[..., 1, 1]]
-    return [*diagonal.unbind(-1), *last], [*squares.unbind(-1), rest[..., 1, 0].square()]
+
+def _largest(gram: Tensor) -> Tensor:
+    """The largest |entry|, (..., 1, 1), by which its squares neither overflow nor vanish; 1 of zeros."""
+    largest = gram.abs().amax((-2, -1), keepdim=True)
+    return torch.where(largest > 0, largest, 1.0)

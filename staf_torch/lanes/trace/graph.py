@@ -136,6 +136,8 @@ class Graph:
         op, aux = self.op[node], self.aux[node]
         if op == "map":
             return math.prod(aux[1])
+        if op == "tridiagonal":
+            return 2 * int(aux[1][0])
         if op in ("collect", "carrys", "results"):
             return int(aux[2])
         return int(aux if op == "pack" else aux[0]) if op in ("pack", "dot") else 1

@@ -204,6 +204,12 @@ class Tracer(TorchDispatchMode):
         array = self.graph.add("dot", (a, b), kind, (outs, shape[-1], at, by))
         return self.entries(array, kind, outs).reshape(shape[:-1])
 
+    def tridiagonal(self, flat: Ids, size: int, kind: str) -> Ids:
+        """Of a symmetric matrix over its largest |entry|: the diagonal, the squares beside it; that entry."""
+        array, places = self.array(flat, kind)
+        aux = ("copy", (size, size), tuple(places.tolist()))
+        return self.entries(self.graph.add("tridiagonal", (array,), kind, aux), kind, 2 * size)
+
     def _folds(self, arrays: Sequence[Ids]) -> bool:
         op = self.graph.op
         return all(op[n] == "const" for array in arrays for n in set(array.reshape(-1).tolist()))
