@@ -275,3 +275,15 @@ def exponential(matrix: Tensor) -> Tensor:
     with alone(matrix.numel()):
         found: Tensor = torch.linalg.matrix_exp(matrix if several else torch.stack((matrix, matrix)))
     return found if several else found[0]
+
+
+def root(x: Tensor) -> Tensor:
+    """Return the square root; its derivative at 0 is 0."""
+    zero = x == 0
+    return torch.where(zero, 0.0, torch.where(zero, 1.0, x).sqrt())
+
+
+def length(a: Tensor, b: Tensor) -> Tensor:
+    """Return sqrt(a^2 + b^2); its derivative at 0 is 0."""
+    zero = (a == 0) & (b == 0)
+    return torch.where(zero, 0.0, torch.hypot(torch.where(zero, 1.0, a), b))

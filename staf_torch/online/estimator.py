@@ -19,7 +19,7 @@ from ..numerics.checks import fail, integer, trailing
 from ..numerics.default_device import beside, on
 from ..signs import Sign
 from .compiled_filter import DirectCalls
-from .samples import in_place, lapse_of, lapses, like_given, pair, tensor_of
+from .samples import in_place, lapse_of, lapses, like_given, pair, single, tensor_of
 from .scikit_estimator import NotFittedError, ScikitEstimator, parameters
 
 _ABOUT = ("n_features_in_", "n_streams_", "n_outputs_")
@@ -365,7 +365,7 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
 
     def _plain_arguments(self) -> dict[str, Any]:
         """Return decisive arguments that are numbers, flags or None; floats, as a search's may be NumPy's."""
-        found = {name: getattr(self, name) for name in self._decisive()}
+        found = {name: single(getattr(self, name)) for name in self._decisive()}
         real = {k: float(v) for k, v in found.items() if isinstance(v, numbers.Real | np.bool_)}
         return {k: real.get(k) for k, v in found.items() if v is None or k in real}
 

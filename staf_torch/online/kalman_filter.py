@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ..numerics.linalg import length, root
 from .local_functions import LocalFunctions
 from .own_functions import OwnFunctions
 
@@ -131,6 +132,15 @@ class StateParts(NamedTuple):
     largest: Tensor  # (1, S)
 
 
+class Counts(NamedTuple):
+    """Samples of every stream, (S,) int64."""
+
+    learned: Tensor
+    skipped: Tensor
+    streak: Tensor  # out of proportion in a row
+    since: Tensor  # learned since it began
+
+
 class _Outlook(NamedTuple):
     """What is expected of the next y."""
 
@@ -206,18 +216,21 @@ class LocalFilter:
 
     def predict(self, state: StreamState, x: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of the next y at x (S, n): (S, K), (S, K)."""
-        old = state.parts(state.table.double())
-        x = torch.where(torch.isnan(x.mT), old.last, x.mT.double())
-        found = self._outlook(old, x - old.anchor, self.forgetting)
-        fresh = torch.isnan(old.anchor).any(0)  # nothing is known before the first sample
-        mean = torch.where(fresh, 0.0, found.mean)
-        deviation = torch.where(fresh, ((1 + self.ratio) * self.base).sqrt(), found.deviation)
+        mean, deviation = self.expected(state.parts(state.table.double()), x.mT, self.forgetting)
         return mean.mT.to(state.blocks), deviation.mT.to(state.blocks)
 
-    def _outlook(self, old: StateParts, z: Tensor, share: Tensor) -> _Outlook:
-        """What is expected of y at z (n, S) from the anchor; when it comes, this share of D is left."""
-        psi, log_factor = self.functions.local(old.anchor, z)
-        prior = torch.zeros_like(share) + self.functions.prior(old.anchor, z)
+    def expected(self, old: StateParts, x: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation (K, S) of y at x (n, S) when a share (S,) of D is left."""
+        fresh = torch.isnan(old.anchor).any(0)  # nothing is known before the first sample
+        x = torch.where(torch.isnan(x), old.last, x.double())
+        found = self._outlook(old, _known(old.anchor, x), torch.where(fresh, 0.0, x - old.anchor), share)
+        mean = torch.where(fresh, 0.0, found.mean)
+        return mean, torch.where(fresh, ((1 + self.ratio) * self.base).sqrt(), found.deviation)
+
+    def _outlook(self, old: StateParts, here: Tensor, z: Tensor, share: Tensor) -> _Outlook:
+        """What is expected of y at z (n, S) from an anchor; when it comes, this share of D is left."""
+        psi, log_factor = self.functions.local(here, z)
+        prior = torch.zeros_like(share) + self.functions.prior(here, z)
         factor = torch.ones_like(share) if log_factor is None else log_factor.exp()
         *means, one = ((psi * old.mean).sum(-2) * factor).unbind()
         mean = torch.stack(means) + old.level * (1 - one)
@@ -242,29 +255,50 @@ class LocalFilter:
             lapse: time since the sample before, (S,), ones by default: what was learned fades by
             lambda^lapse.
         """
-        x, y = x.mT, y.mT
         lapse = torch.ones_like(self.ratio) if lapse is None else lapse
-        table, (samples, skipped, streak, since) = state.table.double(), state.counts.unbind()
-        old = state.parts(table)
+        counts = Counts(*state.counts.unbind())
+        parts, counts = self.learned(
+            state.parts(state.table.double()), counts, x.mT, y.mT, lapse, torch.finfo(state.dtype)
+        )
+        state.put(state.whole(parts))
+        state.counts.copy_(torch.stack(counts))
+
+    def learned(
+        self, old: StateParts, counts: Counts, x: Tensor, y: Tensor, lapse: Tensor, numbers: torch.finfo
+    ) -> tuple[StateParts, Counts]:
+        """Return the state after one sample a stream.
+
+        Args:
+            old: the state before.
+            counts: samples before.
+            x: (n, S).
+            y: (K, S).
+            lapse: (S,).
+            numbers: limits of the table's dtype.
+        """
+        samples, skipped, streak, since = counts
         measured = ~torch.isnan(x).all(0)
         x = torch.where(torch.isnan(x), old.last, x.double())
         seen = ~torch.isnan(y)
         y = torch.where(seen, y.double(), 0.0)
         size, largest = y.abs().amax(0), old.largest[0]
-        tiny = torch.finfo(state.dtype).eps ** 0.5
+        tiny = numbers.eps**0.5
         sound = measured & seen.any(0) & torch.isfinite(x).all(0) & torch.isfinite(y).all(0)
         huge = (since > 0) & (largest > 0) & (size * tiny > largest)
         small = (size > 0) & (size < largest * tiny)
         streak = torch.where(sound, torch.where(huge | small, streak + 1, streak * (size == 0)), streak)
         afresh = sound & ((streak >= STREAK) | torch.isnan(old.anchor).any(0))
         fine = sound & (~huge | afresh)
+        y = torch.where(torch.isfinite(y), y, 0.0)
 
         z = torch.where(fine & ~afresh, x - old.anchor, 0.0)
         stays = torch.eq(x, old.last).all(0)
         moves = fine & (afresh | ((z * z).sum(0) > self.slack**2))
-        before = self._outlook(old, z, self.forgetting**lapse)
+        share = self.forgetting**lapse
+        here = _known(old.anchor, x)
+        before = self._outlook(old, here, z, share)
         anchor = torch.where(moves, x, old.anchor)
-        left = torch.where(afresh, x, old.anchor)
+        left = torch.where(afresh, x, here)
         transfer, factor = self.functions.transfer(left, torch.where(moves, z, 0.0))
         mean = torch.where(moves, _apply(transfer, old.mean) * (1.0 if factor is None else factor), old.mean)
         half = _apply(transfer, old.learned.transpose(0, 1))  # rows of D T'
@@ -274,20 +308,20 @@ class LocalFilter:
         held = torch.where(torch.isfinite(x), x, old.last)
         kept = old._replace(mean=mean, learned=learned)
         moved = StateParts(anchor, held, *(torch.where(afresh, 0.0, part) for part in kept[2:]))
-        most = torch.finfo(state.dtype).max
-        found, good = self._update(moved, since, _NewSample(z, y, seen, lapse, fine, stays, before, most))
-        faded = moved._replace(learned=moved.learned * self.forgetting**lapse)  # time passes in any case
+        sample = _NewSample(z, y, seen, lapse, fine, stays, before, numbers.max)
+        found, good = self._update(moved, since, sample)
+        faded = moved._replace(learned=moved.learned * share)  # time passes in any case
         both = [torch.where(good, new, old_) for new, old_ in zip(found, faded, strict=True)]
-        state.put(state.whole(StateParts(*both)))
         streak = torch.where(afresh & good, 0, streak)
-        state.counts.copy_(torch.stack((samples + good, skipped + ~good, streak, since + good)))
+        return StateParts(*both), Counts(samples + good, skipped + ~good, streak, since + good)
 
     def _update(self, old: StateParts, since: Tensor, sample: _NewSample) -> tuple[StateParts, Tensor]:
         """The Kalman update at z from the anchor; and the streams whose result is finite."""
         z, y, seen, lapse, fine, stays, before, most = sample
-        (psi, log_factor), noise = self.functions.local(old.anchor, z), self.ratio
+        here = _known(old.anchor, old.last)
+        (psi, log_factor), noise = self.functions.local(here, z), self.ratio
         largest = torch.maximum(old.largest, y.abs().amax(0))
-        prior = torch.zeros_like(lapse) + self.functions.prior(old.anchor, z)
+        prior = torch.zeros_like(lapse) + self.functions.prior(here, z)
         shrink = torch.ones_like(lapse) if log_factor is None else (-log_factor).exp()
         noise = noise * shrink.square()
         share = self.forgetting**lapse
@@ -299,12 +333,14 @@ class LocalFilter:
         # nothing was expected of the first value, nor where a kernel overflows
         expects = (old.told > 0) & torch.isfinite(before.mean) & torch.isfinite(before.deviation)
         away = torch.where(expects, (y - before.mean).abs() / before.deviation, 0.0).clamp(max=1e150)
-        kept = torch.where(away > self.robust, self.robust / away, 1.0)
+        beyond = away > self.robust
+        kept = torch.where(beyond, self.robust / torch.where(beyond, away, 1.0), 1.0)
         counts = torch.where(kept < 1, kept * (left[:-1] - of_level) + of_level, left[:-1])
         change = torch.cat((torch.where(seen, counts, 0.0), left[-1:])) / spread
         mean = old.mean + gain * change.unsqueeze(-2)
         first = seen & (old.told == 0)  # as if it had always been so
-        mean[:-1] = torch.where(first.unsqueeze(1), y.unsqueeze(1) * mean[-1], mean[:-1])
+        told = torch.where(first.unsqueeze(1), y.unsqueeze(1) * mean[-1], mean[:-1])
+        mean = torch.cat((told, mean[-1:]))
         learned = old.learned * share + gain.unsqueeze(1) * (gain / spread)
         errors, surprises = self._errors(old, away, before.weight.nan_to_num(0.0))
         level, deviation, leaps, told = spread_with(
@@ -327,18 +363,18 @@ class LocalFilter:
     def _errors(self, old: StateParts, away: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
         """Errors and surprises after an error of so many deviations."""
         inside = (1 + weight * (away.square() - 1)).clamp(min=0.0)
-        counted = (self._amplitude(old) * inside.sqrt()).clamp(max=1e300)
+        counted = (self._amplitude(old) * root(inside)).clamp(max=1e300)
         limited, surprises = _limited(
             counted, torch.maximum(old.errors, LEAST * self._spread(old)), old.surprises, old.told
         )
         rate = (1 / (old.told - 1).clamp(min=1.0)).clamp(min=ERROR_RATE)
-        errors = torch.hypot((1 - rate).sqrt() * old.errors, rate.sqrt() * limited)
+        errors = length((1 - rate).sqrt() * old.errors, rate.sqrt() * limited)
         return torch.where(old.told >= 2, errors, 0.0), surprises
 
     def _amplitude(self, old: StateParts) -> Tensor:
         """c: the prior's amplitude at first, then what errors say."""
         trust = (old.told - 2).clamp(0.0, 20.0) / 20.0
-        found = torch.hypot(old.errors * trust.sqrt(), (self.base * (1 - trust)).sqrt())
+        found = length(old.errors * trust.sqrt(), root(self.base * (1 - trust)))
         return torch.maximum(found, LEAST * self._spread(old))
 
     def _spread(self, old: StateParts) -> Tensor:
@@ -367,10 +403,15 @@ def spread_with(
     """
     rate = torch.minimum(3 / (told + 3), 1 / (told - 40).clamp(min=1.0)).clamp(min=SPREAD_RATE)
     step, leaps = _limited((y - level).abs(), size, leaps, torch.where(told > 0, age, 0.0))
-    wide = (1 - rate).sqrt() * torch.hypot(spread, rate.sqrt() * step)
+    wide = (1 - rate).sqrt() * length(spread, rate.sqrt() * step)
     counts = (wide > 0) | (told == 0)
     told = torch.where(counts, (told + 1).clamp(max=2 / SPREAD_RATE), told)
     return level + rate * torch.where(y < level, -step, step), wide, leaps, told
+
+
+def _known(anchor: Tensor, x: Tensor) -> Tensor:
+    """Return the anchors, x of streams that have none: a NaN would reach the gradients of all others."""
+    return torch.where(torch.isnan(anchor), torch.where(torch.isfinite(x), x, 1.0), anchor)
 
 
 def _limited(value: Tensor, running: Tensor, row: Tensor, told: Tensor) -> tuple[Tensor, Tensor]:

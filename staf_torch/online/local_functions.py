@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ..kernels import Kernel
+from ..numerics.linalg import root
 from ..numerics.pivoted_cholesky import newton_basis
 
 _JUMP = 4.0  # radii: beyond, a kernel whose scale grows with the state says nothing about the new one
@@ -135,7 +136,7 @@ class LocalFunctions(NamedTuple):
         half = self._half(state, h.mT)
         if self.rate is not None and self.shared is not None and self.pairs is not None:
             exponent = (self.rate * d) @ h  # q h'd, (M, R)
-            shift = self.rate * h.square().sum(0).sqrt() * reach  # so that neither exponential overflows
+            shift = self.rate * root(h.square().sum(0)) * reach  # so that neither exponential overflows
             rows = (self.pairs @ (exponent - shift).exp()).unflatten(0, (len(d), -1))
             lost = self.rate * h.square().sum(0) / 2
             rows = rows * (shift - exponent - lost).clamp(max=700.0).exp().unsqueeze(1)

@@ -11,6 +11,7 @@ from torch import Tensor
 from ..kernels import Kernel
 from ..lanes.row_numbers import RowNumbers, all_rows, columns
 from ..numerics.checks import fail, own_number
+from ..numerics.linalg import root
 from ..numerics.pivoted_cholesky import newton_basis
 
 NAMES = ("radius", "noise", "amplitude", "forgetting", "follow", "robust")
@@ -64,7 +65,7 @@ class OwnFunctions(NamedTuple):
         near = (step.double() / reach).square().sum(0) <= _FAR**2
         h = torch.where(near, step.double(), 0.0)
         along = self.rate * (self.offsets * h).sum(1)  # (M, S)
-        shift, lost = self.rate * h.square().sum(0).sqrt() * reach, self.rate * h.square().sum(0) / 2
+        shift, lost = self.rate * root(h.square().sum(0)) * reach, self.rate * h.square().sum(0) / 2
         before, after = (along - shift).exp(), (shift - along - lost).clamp(max=700.0).exp()
         moved = torch.einsum("jis,jls->ils", self.gram, before.unsqueeze(1) * self.shared)
         found = torch.einsum("iks,ils->kls", self.shared, after.unsqueeze(1) * moved)
@@ -92,7 +93,9 @@ def own_law(call: str, numbers: dict[str, Any], dtype: torch.dtype, streams: int
         checked = own_number(call, name, value, sign)
         if isinstance(checked, RowNumbers):
             return columns([checked], streams)[0].double()
-        return torch.full((streams,), float(checked), dtype=torch.float64, device="cpu")
+        if isinstance(checked, Tensor):
+            return checked.double().expand(streams)
+        return torch.full((streams,), checked, dtype=torch.float64, device="cpu")
 
     found = {name: column(name, value) for name, value in numbers.items() if value is not None}
     found.setdefault("robust", torch.full((streams,), torch.inf, dtype=torch.float64, device="cpu"))
@@ -120,4 +123,4 @@ def own_functions(call: str, kernel: Kernel, radius: Tensor, toward: Tensor) -> 
         if isinstance(rate, RowNumbers)
         else all_rows(rate).expand(len(radius))
     )
-    return OwnFunctions.of(rates.detach().double(), radius[:, None, None] * toward.double())
+    return OwnFunctions.of(rates.double(), radius[:, None, None] * toward.double())

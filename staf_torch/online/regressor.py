@@ -13,17 +13,19 @@ from torch import Tensor
 
 from ..centers import ball, rings
 from ..centers.layouts import RING_COUNTS
-from ..kernels import NAMED, Kernel
+from ..kernels import NAMED, GaussianKernel, Kernel
 from ..lanes.gradients import refuse_gradient
+from ..lanes.row_numbers import RowNumbers
 from ..numerics.checks import choice, fail, flag, integer, positive_real, real
 from ..numerics.default_device import on
 from ..signs import Sign
 from .estimator import StreamEstimator, Streams
 from .filter_streams import FilterStreams
+from .forecasts import Forecast, forecasts, log_density
 from .kalman_filter import LocalFilter, StreamState
 from .local_functions import LocalFunctions
-from .own_functions import NAMES, has_rows, own_functions, own_law
-from .samples import lapses, like_given, pair, tensor_of
+from .own_functions import NAMES, OwnFunctions, has_rows, own_functions, own_law
+from .samples import lapses, like_given, pair, single, tensor_of
 from .smoothing import smooth_record
 from .tuning import Tuning, tuned_streams, tuning
 from .turning_streams import TurningStreams, turned_in_time
@@ -185,6 +187,83 @@ class StaFRegressor(StreamEstimator):
         found = mean * spread[:, n:] + center[:, n:], deviation * spread[:, n:]
         return like_given(y, found[0].reshape(values.shape)), like_given(y, found[1].reshape(values.shape))
 
+    @Sign("StaFRegressor.forecast")
+    def forecast(self, x: Any, y: Any, time: Any = None) -> Forecast:
+        """Predict every sample of a stretch from those before it, with gradients by all that it depends on.
+
+        p(y_k | y_0, ..., y_k-1) = N(mean_k, deviation_k^2), as `predict` before each `partial_fit`, by a
+        filter that begins anew. x, y, a kernel's parameters, ``radius``, ``noise``, ``amplitude``,
+        ``forgetting`` and ``robust`` that require a gradient get it, as tensors or as `staf_torch.rows`, a
+        number a stream: the sum of ``log_density`` is the likelihood of the stretch. Of a Gaussian kernel it
+        is compiled, forwards and backwards; other kernels run in plain torch.
+
+        Args:
+            x: (T, n), one stream in time, or (T, S, n), S streams.
+            y: x's shape without n, or with K in place of n for K outputs.
+            time: as in `fit`: a sample is expected as late as it comes.
+
+        Returns:
+            Mean and standard deviation in the shape of y, noise included, and log p, (T,) or (T, S), 0 where
+            y was not measured. With ``scaling`` the units are those of the whole stretch. What this regressor
+            has learned stays as it is.
+
+        Raises:
+            ValueError: if a shape is another one, or an argument of the constructor breaks its rule.
+
+        Source: Kalman (1960); Rasmussen and Williams, Gaussian Processes for Machine Learning, section 2.3,
+        for hyperparameters by the likelihood.
+        """
+        call = f"{_NAME}.forecast"
+        states, values = pair(call, x, y, (2, 3), recorded=True)
+        states = turned_in_time(states, self._angles(states.shape[-1]))
+        steps, n = lapses(call, time, states), states.shape[-1]
+        at = states.double().reshape(len(states), -1, n)
+        of = values.double().reshape(*at.shape[:2], -1)
+        count, outputs = of.shape[1:]
+        with torch.no_grad():
+            center, spread = self._units(at, of, states, values)
+        late = at.new_ones(at.shape[:2]) if steps is None else steps.expand(at.shape[:2])
+        sides = [part.transpose(0, 1) for part in ((at - center[:, :n]) / spread[:, :n], late)]
+        goal = ((of - center[:, n:]) / spread[:, n:]).transpose(0, 1)
+        with on(states.device):
+            filter_ = self._recorded_filter(count, outputs, n)
+            found = forecasts(filter_, sides[0], goal, sides[1])
+        mean = found[0].transpose(0, 1) * spread[:, n:] + center[:, n:]
+        deviation = found[1].transpose(0, 1) * spread[:, n:]
+        likely = log_density(of, mean, deviation).sum(-1).reshape(states.shape[:-1])
+        parts = mean.reshape(values.shape), deviation.reshape(values.shape), likely
+        parts = tuple(part.to(values.dtype) for part in parts)
+        return Forecast(*(part if part.requires_grad else like_given(y, part) for part in parts))
+
+    def _units(self, at: Tensor, of: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        """Return centers and spreads (S, n + K) of a record: 0 and 1 where there are no units."""
+        twin = self._twin()
+        twin._prepare(x[0], y[0])
+        streams = twin._streams_.inner if isinstance(twin._streams_, TurningStreams) else twin._streams_
+        assert isinstance(streams, FilterStreams)
+        return streams.units_for(torch.cat((at, of), -1))
+
+    def _recorded_filter(self, streams: int, outputs: int, dim: int) -> LocalFilter:
+        """Return the filter of tensors that autograd sees."""
+        toward, found = self._directions(dim), self._tuning
+        robust = math.inf if self.robust is None else self.robust
+        if found is not None and found.center.shape == (streams, dim + outputs):
+            radius = found.radius[:1].expand(streams)
+            functions = own_functions(_NAME, GaussianKernel(1.0), radius, toward)
+            slack = float(single(self.follow)) * radius
+            return LocalFilter(functions, found.ratio, found.forgetting, slack, robust)
+        law = own_law(_NAME, {name: getattr(self, name) for name in NAMES}, torch.float64, streams)
+        kernel = self.kernel if isinstance(self.kernel, Kernel) else _kernel(self.kernel)
+        rate, ratio = kernel.exponent_rate(), (law["noise"] / law["amplitude"]).square()
+        slack, base = (law["follow"] * law["radius"]).detach(), law["amplitude"].square()
+        plain = kernel.state_free and rate is not None and kernel.log_gain(toward[:1]) is None
+        functions: OwnFunctions | LocalFunctions
+        if plain or isinstance(self.radius, RowNumbers):
+            functions = own_functions(_NAME, kernel, law["radius"], toward)
+        else:
+            functions = LocalFunctions.of(kernel, law["radius"][0] * toward)
+        return LocalFilter(functions, ratio, law["forgetting"], slack, law["robust"], base)
+
     def _begin(self, streams: int, outputs: int, like: Tensor) -> Streams:
         begun, angles = self._filters(streams, outputs, like), self._angles(len(like))
         if not angles:
@@ -201,16 +280,17 @@ class StaFRegressor(StreamEstimator):
         dim, dtype, toward = len(like), like.dtype, self._directions(len(like))
         scaling, found = flag(_NAME, "scaling", self.scaling), self._tuning
         kernel, numbers = _kernel(self.kernel), {name: getattr(self, name) for name in NAMES}
+        refuse_gradient(_NAME, **numbers)
         tuned = found is not None and found.center.shape == (streams, dim + outputs)
         if not tuned and has_rows(numbers, kernel):
             return self._own_filters(kernel, numbers, toward, streams, outputs, like)
-        robust = math.inf if self.robust is None else positive_real(_NAME, "robust", self.robust)
+        robust = math.inf if self.robust is None else positive_real(_NAME, "robust", single(self.robust))
         if found is not None and tuned:
             self.centers_offsets_ = found.radius[0] * toward
-            return tuned_streams(found, toward, dtype, robust, float(self.follow))
-        radius = positive_real(_NAME, "radius", self.radius)
+            return tuned_streams(found, toward, dtype, robust, float(single(self.follow)))
+        radius = positive_real(_NAME, "radius", single(self.radius))
         law = torch.tensor(self._law(dtype), dtype=torch.float64, device=like.device)
-        follow = real(_NAME, "follow", self.follow)
+        follow = real(_NAME, "follow", single(self.follow))
         if follow < 0:
             raise fail(_NAME, "follow", "must not be negative", self.follow)
         self.centers_offsets_ = offsets = radius * toward.to(like.device)
@@ -220,7 +300,7 @@ class StaFRegressor(StreamEstimator):
         functions = LocalFunctions.of(kernel, offsets)
         _check_reach(functions, radius)
         ratio, forgetting = law.unsqueeze(1).repeat(1, streams)
-        base = float(self.amplitude) ** 2
+        base = float(single(self.amplitude)) ** 2
         filter_ = LocalFilter(functions, ratio, forgetting, follow * radius, robust, base)
         return FilterStreams(filter_, StreamState.empty(like, streams, dim, len(offsets), outputs), scaling)
 
@@ -244,13 +324,13 @@ class StaFRegressor(StreamEstimator):
 
     def _law(self, dtype: torch.dtype) -> tuple[float, float]:
         """Return the checked variance of the noise in units of the process's, and the forgetting."""
-        noise = positive_real(_NAME, "noise", self.noise)
-        ratio = (noise / positive_real(_NAME, "amplitude", self.amplitude)) ** 2
+        noise = positive_real(_NAME, "noise", single(self.noise))
+        ratio = (noise / positive_real(_NAME, "amplitude", single(self.amplitude))) ** 2
         precision = torch.finfo(dtype).eps
         if ratio < _PLAIN * precision:
             rule = f"must be at least {math.sqrt(_PLAIN * precision):.1e} amplitude in {dtype}"
             raise fail(_NAME, "noise", rule, self.noise)
-        forgetting = real(_NAME, "forgetting", self.forgetting)
+        forgetting = real(_NAME, "forgetting", single(self.forgetting))
         if not 0 < forgetting <= 1:
             raise fail(_NAME, "forgetting", "must be in (0, 1]", self.forgetting)
         return ratio, forgetting

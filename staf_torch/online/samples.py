@@ -12,10 +12,17 @@ from ..lanes.gradients import refuse_gradient
 from ..numerics.checks import fail
 
 
-def tensor_of(call: str, name: str, value: Any) -> Tensor:
-    """A tensor as it is; arrays and numbers as tensors; integers as float64."""
+def tensor_of(call: str, name: str, value: Any, *, recorded: bool = False) -> Tensor:
+    """A tensor as it is; arrays and numbers as tensors; integers as float64.
+
+    Args:
+        call: in whose name an error speaks.
+        name: of the argument.
+        value: that was given.
+        recorded: whether a tensor that requires a gradient is taken with it, and not refused.
+    """
     if isinstance(value, Tensor):
-        if value.requires_grad:
+        if value.requires_grad and not recorded:
             refuse_gradient(call, **{name: value})
         if torch._C._functorch.is_functorch_wrapped_tensor(value):
             rule = "must hold all samples at once: transforms of `torch.func` have no part in it"
@@ -27,7 +34,7 @@ def tensor_of(call: str, name: str, value: Any) -> Tensor:
             raise ValueError(
                 f"`{call}({name}=...)` must be a dense tensor of real numbers; got one that is {form}."
             )
-        found = value.detach()
+        found = value if recorded else value.detach()
     else:
         try:
             if hasattr(value, "toarray"):
@@ -49,6 +56,12 @@ def tensor_of(call: str, name: str, value: Any) -> Tensor:
     return found if found.is_floating_point() else found.double()
 
 
+def single(value: Any) -> Any:
+    """Return the number that a tensor without dimensions holds; anything else, numbers of rows too, as it is."""
+    plain = type(value) in (Tensor, torch.nn.Parameter) and value.dim() == 0
+    return value.item() if plain else value
+
+
 def in_place(value: Any, dtype: torch.dtype | None, shape: tuple[int, ...]) -> bool:
     """Return whether compiled code can read a sample where it lies, as one of this dtype and shape."""
     return (
@@ -62,10 +75,12 @@ def in_place(value: Any, dtype: torch.dtype | None, shape: tuple[int, ...]) -> b
     )
 
 
-def pair(call: str, x: Any, y: Any, dims: tuple[int, int]) -> tuple[Tensor, Tensor]:
+def pair(
+    call: str, x: Any, y: Any, dims: tuple[int, int], *, recorded: bool = False
+) -> tuple[Tensor, Tensor]:
     if y is None:
         raise ValueError(f"`{call}` requires y to be passed, but the target y is None.")
-    states, values = tensor_of(call, "x", x), tensor_of(call, "y", y)
+    states, values = (tensor_of(call, name, part, recorded=recorded) for name, part in (("x", x), ("y", y)))
     if 0 in states.shape:
         shape = tuple(states.shape)
         what = f"{states.shape[-1]} feature(s)" if 0 in states.shape[-1:] else "0 sample(s)"

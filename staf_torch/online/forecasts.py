@@ -1,0 +1,98 @@
+"""The filter over a recorded stretch as a row program, with gradients by all that it reads."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..lanes import Program
+from ..lanes.tree import Tree
+from .kalman_filter import Counts, LocalFilter, StateParts
+from .local_functions import LocalFunctions
+from .own_functions import OwnFunctions
+
+_NUMBERS = torch.finfo(torch.float64)
+
+
+class Forecast(NamedTuple):
+    """What was expected of every sample before it was learned, and how likely it was then."""
+
+    mean: Tensor  # in the shape of y
+    deviation: Tensor  # standard deviation, noise included; as the mean
+    log_density: Tensor  # of y, all outputs, (T,) or (T, S); 0 where none was measured
+
+
+def log_density(y: Tensor, mean: Tensor, deviation: Tensor) -> Tensor:
+    """log N(y; mean, deviation), entry by entry; 0 where y was not measured."""
+    seen = torch.isfinite(y)
+    z = (torch.where(seen, y, mean) - mean) / deviation
+    found = -0.5 * z.square() - deviation.log() - 0.5 * math.log(2 * math.pi)
+    return torch.where(seen, found, 0.0)
+
+
+def forecasts(filter_: LocalFilter, x: Tensor, y: Tensor, lapse: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation of every sample, from those before it: (S, T, K) each.
+
+    With `OwnFunctions` compiled, forwards and backwards; with others in plain torch.
+
+    Args:
+        filter_: of S streams that have learned nothing.
+        x: (S, T, n), float64.
+        y: (S, T, K).
+        lapse: (S, T).
+    """
+    rows, functions = len(x), filter_.functions
+    law = (filter_.ratio, filter_.forgetting, filter_.slack, filter_.robust, filter_.base)
+    numbers = tuple(torch.as_tensor(part, device=x.device).double().expand(rows) for part in law)
+    if isinstance(functions, OwnFunctions):
+        row = tuple(part.movedim(-1, 0) for part in functions), numbers
+        return _FILTER(_fresh(x, y, functions.offsets.shape[0]), (x, y, lapse), row)[1]
+
+    def step(carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
+        return _after(functions, carry, now, row)
+
+    program = Program(step, name=_FILTER.name, compile=False)
+    return program(_fresh(x, y, len(functions.offsets)), (x, y, lapse), numbers)[1]
+
+
+def _fresh(x: Tensor, y: Tensor, count: int) -> Tree:
+    """The carry of streams that have learned nothing: the parts of their state, and counts."""
+    (rows, _, n), k = x.shape, y.shape[-1]
+    new = x.detach().new_zeros
+    nowhere = x.detach().new_full((rows, n), math.nan)
+    lower = count * (count + 1) // 2
+    rest = [new(rows, k) for _ in range(7)]
+    parts = (nowhere, nowhere, new(rows, k + 1, count), new(rows, lower), *rest, new(rows, 1), new(rows, 1))
+    return parts, tuple(new(rows, dtype=torch.int64) for _ in Counts._fields)
+
+
+def _step(carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
+    """Expect a sample, and learn it: streams are the first dimension."""
+    functions, law = row
+    return _after(OwnFunctions(*(part.movedim(0, -1) for part in functions)), carry, now, law)
+
+
+def _after(functions: LocalFunctions | OwnFunctions, carry: Tree, now: Tree, law: Tree) -> tuple[Tree, Tree]:
+    (parts, counts), (x, y, lapse) = carry, now
+    ratio, forgetting, slack, robust, base = law
+    filter_ = LocalFilter(functions, ratio, forgetting, slack, robust, base)
+    old = StateParts(*(part.movedim(0, -1) for part in parts))
+    count = old.mean.shape[1]
+    entries = [(i, j) for i in range(count) for j in range(count)]
+    whole = old.learned[[max(i, j) * (max(i, j) + 1) // 2 + min(i, j) for i, j in entries]]
+    whole = whole.unflatten(0, (count, count))
+    # what counts values has no derivative
+    still = {name: getattr(old, name).detach() for name in ("surprises", "told", "leaps")}
+    old = old._replace(learned=whole, **still)
+    x, y = x.mT, y.mT
+    expected = filter_.expected(old, x, forgetting**lapse)
+    new, seen = filter_.learned(old, Counts(*counts), x, y, lapse, _NUMBERS)
+    lower = new.learned.flatten(0, 1)[[count * i + j for i, j in entries if j <= i]]
+    after = tuple(part.movedim(-1, 0) for part in new._replace(learned=lower))
+    return (after, tuple(seen)), tuple(part.mT for part in expected)
+
+
+_FILTER = Program(_step, name="StaFRegressor over a stretch")
