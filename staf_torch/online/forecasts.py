@@ -49,13 +49,15 @@ def forecasts(filter_: LocalFilter, x: Tensor, y: Tensor, lapse: Tensor) -> tupl
     numbers = tuple(torch.as_tensor(part, device=x.device).double().expand(rows) for part in law)
     if isinstance(functions, OwnFunctions):
         row = tuple(part.movedim(-1, 0) for part in functions), numbers
-        return _FILTER(_fresh(x, y, functions.offsets.shape[0]), (x, y, lapse), row)[1]
+        mean, deviation = _FILTER(_fresh(x, y, functions.offsets.shape[0]), (x, y, lapse), row)[1]
+        return mean, deviation
 
     def step(carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
         return _after(functions, carry, now, row)
 
     program = Program(step, name=_FILTER.name, compile=False)
-    return program(_fresh(x, y, len(functions.offsets)), (x, y, lapse), numbers)[1]
+    mean, deviation = program(_fresh(x, y, len(functions.offsets)), (x, y, lapse), numbers)[1]
+    return mean, deviation
 
 
 def _fresh(x: Tensor, y: Tensor, count: int) -> Tree:

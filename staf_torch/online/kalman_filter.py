@@ -235,7 +235,8 @@ class LocalFilter:
         *means, one = ((psi * old.mean).sum(-2) * factor).unbind()
         mean = torch.stack(means) + old.level * (1 - one)
         known = (psi * _apply(old.learned, psi)).sum(0)  # psi'D psi
-        unknown = (1 - share * known / prior).clamp(0.0, 1.0)
+        some = prior > 0  # an anchored kernel knows the origin
+        unknown = torch.where(some, 1 - share * known / torch.where(some, prior, 1.0), 0.0).clamp(0.0, 1.0)
         usual = torch.minimum(NOVEL * old.usual[0], 1 - (1 - old.usual[0]) / 4)
         away = ((unknown - usual) / (1 - usual).clamp(min=1e-9)).clamp(0.0, 1.0)
         near = self._amplitude(old) * (torch.minimum(unknown, usual) * prior * factor**2 + self.ratio).sqrt()
@@ -332,7 +333,8 @@ class LocalFilter:
         of_level = old.level * left[-1]
         # nothing was expected of the first value, nor where a kernel overflows
         expects = (old.told > 0) & torch.isfinite(before.mean) & torch.isfinite(before.deviation)
-        away = torch.where(expects, (y - before.mean).abs() / before.deviation, 0.0).clamp(max=1e150)
+        expected = (torch.where(expects, part, 1.0) for part in (before.mean, before.deviation))
+        away = torch.where(expects, (y - next(expected)).abs() / next(expected), 0.0).clamp(max=1e150)
         beyond = away > self.robust
         kept = torch.where(beyond, self.robust / torch.where(beyond, away, 1.0), 1.0)
         counts = torch.where(kept < 1, kept * (left[:-1] - of_level) + of_level, left[:-1])

@@ -129,7 +129,7 @@ class StaFRegressor(StreamEstimator):
         return self._tuning
 
     @Sign("StaFRegressor.tune")
-    def tune(self, x: Any, y: Any) -> Self:
+    def tune(self, x: Any, y: Any, method: str = "search") -> Self:
         """Learn the hyperparameters from a stretch, stream by stream, and hold them from now on.
 
         Width (a coordinate each), noise, forgetting and radius, Gaussian kernel, by the one-step predictive
@@ -142,13 +142,20 @@ class StaFRegressor(StreamEstimator):
         Args:
             x: (T, n), one stream in time, or (T, S, n), S streams; some hundred samples.
             y: x's shape without n, or with K in place of n for K outputs.
+            method: from the best of a grid, ``search`` draws candidates around it; ``gradient`` goes up the
+                likelihood, by a program that takes seconds to compile for every n, count and K, once. It
+                finds more likely hyperparameters and takes longer from three coordinates on.
+
+        Raises:
+            ValueError: if a shape is another one, or the method.
         """
+        choice(f"{_NAME}.tune", "method", method, ("search", "gradient"))
         states, values = pair(f"{_NAME}.tune", x, y, (2, 3))
         states = turned_in_time(states, self._angles(states.shape[-1]))
         targets = values if values.dim() == states.dim() else values.unsqueeze(-1)
         rows = [part.unsqueeze(1) if states.dim() == 2 else part for part in (states, targets)]
         with on(states.device):
-            found = tuning(rows[0], rows[1], self._directions(states.shape[-1]))
+            found = tuning(rows[0], rows[1], self._directions(states.shape[-1]), method)
         self._change(self._hold, found)
         return self
 
@@ -232,8 +239,8 @@ class StaFRegressor(StreamEstimator):
         deviation = found[1].transpose(0, 1) * spread[:, n:]
         likely = log_density(of, mean, deviation).sum(-1).reshape(states.shape[:-1])
         parts = mean.reshape(values.shape), deviation.reshape(values.shape), likely
-        parts = tuple(part.to(values.dtype) for part in parts)
-        return Forecast(*(part if part.requires_grad else like_given(y, part) for part in parts))
+        typed = [part.to(values.dtype) for part in parts]
+        return Forecast(*(part if part.requires_grad else like_given(y, part) for part in typed))
 
     def _units(self, at: Tensor, of: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """Return centers and spreads (S, n + K) of a record: 0 and 1 where there are no units."""
@@ -249,9 +256,9 @@ class StaFRegressor(StreamEstimator):
         robust = math.inf if self.robust is None else self.robust
         if found is not None and found.center.shape == (streams, dim + outputs):
             radius = found.radius[:1].expand(streams)
-            functions = own_functions(_NAME, GaussianKernel(1.0), radius, toward)
+            tuned = own_functions(_NAME, GaussianKernel(1.0), radius, toward)
             slack = float(single(self.follow)) * radius
-            return LocalFilter(functions, found.ratio, found.forgetting, slack, robust)
+            return LocalFilter(tuned, found.ratio, found.forgetting, slack, robust)
         law = own_law(_NAME, {name: getattr(self, name) for name in NAMES}, torch.float64, streams)
         kernel = self.kernel if isinstance(self.kernel, Kernel) else _kernel(self.kernel)
         rate, ratio = kernel.exponent_rate(), (law["noise"] / law["amplitude"]).square()

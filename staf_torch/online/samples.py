@@ -57,7 +57,7 @@ def tensor_of(call: str, name: str, value: Any, *, recorded: bool = False) -> Te
 
 
 def single(value: Any) -> Any:
-    """Return the number that a tensor without dimensions holds; anything else, numbers of rows too, as it is."""
+    """Return the number of a tensor without dimensions; anything else as it is, numbers of rows too."""
     plain = type(value) in (Tensor, torch.nn.Parameter) and value.dim() == 0
     return value.item() if plain else value
 

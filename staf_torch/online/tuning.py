@@ -1,9 +1,15 @@
-"""Hyperparameters from a recorded stretch: all candidates are streams of one tensor batch."""
+"""Hyperparameters from a recorded stretch: all candidates are streams of one tensor batch.
+
+Both methods begin at the best of a grid. The search draws candidates around it, twice; the gradient goes up
+the likelihood by steps of Adam (Kingma and Ba, 2015) in the logarithms, from the best two of the grid.
+"""
 
 from __future__ import annotations
 
+import functools
 import logging
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -12,8 +18,10 @@ from torch import Tensor
 from ..kernels import GaussianKernel
 from ..numerics.default_device import designed_on_cpu
 from .filter_streams import FilterStreams, units_of
+from .forecasts import forecasts
 from .kalman_filter import LocalFilter, StreamState
 from .local_functions import LocalFunctions
+from .own_functions import OwnFunctions
 
 _log = logging.getLogger(__name__)
 
@@ -24,6 +32,11 @@ RADII = (0.25, 0.5)  # in widths
 DEFAULT = (1.0, 1e-2, 0.999)  # width, noise, forgetting of a regressor not tuned: among the candidates
 ROUNDS = (0.6, 0.3)  # spread of the logarithms of the candidates around the best so far
 AROUND = 48  # of these candidates a round
+STARTS = 2  # of the grid, from which the gradient goes up
+STEPS = 16  # that it takes
+LENGTH = 0.5  # of the first of them, in logarithms; the last is a sixteenth of it
+MEMORY = (0.5, 0.8)  # of Adam's means: steps are few
+FADES, LEAST_NOISE = (1e-4, 0.2), 1e-5  # what is forgotten between samples, and the noise, lie beyond
 SHORT = 0.35  # widths / sqrt(n), nearly what all of x covers of the widest: a coordinate with less is logged
 LITTLE = 6.0  # nats, log of the number of candidates: what is worth less may be luck of the best of them
 FAILS = 0.05  # share of samples that no candidate need explain
@@ -62,14 +75,18 @@ class _Candidates(NamedTuple):
     forgetting: Tensor  # (S, C)
 
 
+Scores = Callable[[_Candidates], Tensor]  # likelihoods (S, C) of the later two thirds
+
+
 @designed_on_cpu
-def tuning(x: Tensor, y: Tensor, directions: Tensor) -> Tuning:
+def tuning(x: Tensor, y: Tensor, directions: Tensor, method: str = "search") -> Tuning:
     """Widths a coordinate, noise, forgetting and radius a stream by the one-step predictive likelihood.
 
     Args:
         x: (T, S, n), a stretch of every stream.
         y: (T, S, K).
         directions: of the centers, (M, n).
+        method: ``search`` or ``gradient``.
     """
     both = torch.cat((x, y), -1).double()
     seen = torch.isfinite(both)
@@ -86,14 +103,11 @@ def tuning(x: Tensor, y: Tensor, directions: Tensor) -> Tuning:
     first = first._replace(width=first.width.unsqueeze(-1).expand(-1, -1, n))
     found: list[tuple[Tensor, _Candidates, Tensor]] = []
     for radius in RADII:
-        best, score = _best(first, samples, n, radius * directions)
-        draw = torch.Generator().manual_seed(0)
-        for wide in ROUNDS:
-            again, better = _best(_around(best, wide, draw), samples, n, radius * directions)
-            gains = better > score
-            best = _Candidates(*(_choose(gains, new, old) for new, old in zip(again, best, strict=True)))
-            score = torch.where(gains, better, score)
-        found.append((score, best, _unknown(best, score, samples, n, radius * directions)))
+        scores: Scores = _StretchScores(samples, n, radius * directions)
+        if method == "search":
+            scores = functools.partial(_scores, samples=samples, n=n, offsets=radius * directions)
+        best, score = (_searched if method == "search" else _ascended)(first, scores)
+        found.append((score, best, _unknown(best, score, scores)))
     which = torch.stack([score for score, *_ in found]).argmax(0)
     one = which == 1
     (small_score, small, small_unknown), (wide_score, wide_best, wide_unknown) = found
@@ -168,6 +182,35 @@ def _scores(candidates: _Candidates, samples: Tensor, n: int, offsets: Tensor) -
     return score
 
 
+class _StretchScores:
+    """`_scores` by the program that runs the filter over a stretch, with gradients by the candidates.
+
+    Args:
+        samples: (T, S, n + K).
+        n: coordinates of x.
+        offsets: of the centers, (M, n).
+    """
+
+    def __init__(self, samples: Tensor, n: int, offsets: Tensor) -> None:
+        self._x, self._y = samples[:, :, None, :n], samples[:, :, None, n:]
+        unit = torch.ones(1, dtype=torch.float64, device="cpu")
+        self._functions = OwnFunctions.of(unit, offsets.unsqueeze(0))
+        self._slack = float(offsets.square().sum(-1).amax().sqrt())
+
+    def __call__(self, candidates: _Candidates) -> Tensor:
+        """Return their likelihoods, (S, C)."""
+        shape, times = candidates.noise.shape, len(self._x)
+        x = (self._x / candidates.width).flatten(1, 2).transpose(0, 1)
+        y = self._y.expand(-1, *shape, -1).flatten(1, 2).transpose(0, 1)
+        functions = OwnFunctions(*(part.expand(*part.shape[:-1], len(x)) for part in self._functions))
+        law = candidates.noise.flatten() ** 2, candidates.forgetting.flatten()
+        found = forecasts(LocalFilter(functions, *law, self._slack), x, y, x.new_ones(len(x), times))
+        later = slice(times // 3 + 1, None)
+        density = _log_density(y[:, later], *(part[:, later] for part in found))
+        likelihood: Tensor = density.sum((1, 2)).unflatten(0, shape)
+        return likelihood
+
+
 def _log_density(y: Tensor, mean: Tensor, deviation: Tensor) -> Tensor:
     """log((1 - a) N(y; mean, deviation) + a b(y)) but for constants; 0 where y was not measured.
 
@@ -183,29 +226,68 @@ def _log_density(y: Tensor, mean: Tensor, deviation: Tensor) -> Tensor:
     return torch.where(torch.isnan(y), 0.0, found)
 
 
-def _best(candidates: _Candidates, samples: Tensor, n: int, offsets: Tensor) -> tuple[_Candidates, Tensor]:
+def _best(candidates: _Candidates, scores: Scores) -> tuple[_Candidates, Tensor]:
     """The candidate of each stream that predicts the later two thirds best, (S, 1), and its likelihood."""
-    score = _scores(candidates, samples, n, offsets)
+    score = scores(candidates)
     best = score.argmax(1)
     rows = torch.arange(len(best), device="cpu")
     return _Candidates(*(part[rows, best, None] for part in candidates)), score[rows, best]
 
 
-def _unknown(best: _Candidates, score: Tensor, samples: Tensor, n: int, offsets: Tensor) -> Tensor:
+def _searched(first: _Candidates, scores: Scores) -> tuple[_Candidates, Tensor]:
+    """The best of the grid and of candidates drawn around the best so far, (S, 1), and its likelihood."""
+    best, score = _best(first, scores)
+    draw = torch.Generator().manual_seed(0)
+    for wide in ROUNDS:
+        again, better = _best(_around(best, wide, draw), scores)
+        gains = better > score
+        best = _Candidates(*(_choose(gains, new, old) for new, old in zip(again, best, strict=True)))
+        score = torch.where(gains, better, score)
+    return best, score
+
+
+def _ascended(first: _Candidates, scores: Scores) -> tuple[_Candidates, Tensor]:
+    """The best of the grid and of what the gradient reaches from the best two, (S, 1), and its likelihood."""
+    score, which = scores(first).topk(STARTS, 1)
+    rows = torch.arange(len(which), device="cpu").unsqueeze(1)
+    best = _Candidates(*(part[rows, which] for part in first))
+    fades = (1 - best.forgetting).clamp(*FADES)
+    at = torch.cat((best.width, best.noise.unsqueeze(-1), fades.unsqueeze(-1)), -1).log()
+    mean, square = torch.zeros_like(at), torch.zeros_like(at)
+    for k in range(1, STEPS + 1):
+        with torch.enable_grad():
+            at = at.detach().requires_grad_()
+            noise = at[..., -2].exp().clamp(min=LEAST_NOISE)
+            now = _Candidates(at[..., :-2].exp(), noise, 1 - at[..., -1].exp().clamp(max=FADES[1]))
+            value = scores(now)
+            (slope,) = torch.autograd.grad(value.sum(), at)
+        gains, at = value.detach() > score, at.detach()
+        score = torch.where(gains, value.detach(), score)
+        best = _Candidates(*(_choose(gains, new.detach(), old) for new, old in zip(now, best, strict=True)))
+        slope = slope.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
+        mean, square = mean.lerp(slope, 1 - MEMORY[0]), square.lerp(slope.square(), 1 - MEMORY[1])
+        size = (square / (1 - MEMORY[1] ** k)).sqrt().clamp(min=1e-12)
+        at = at + LENGTH * (1 - (k - 1) / STEPS) * mean / (1 - MEMORY[0] ** k) / size
+    highest = score.argmax(1, keepdim=True)
+    return _Candidates(*(part[rows, highest] for part in best)), score.gather(1, highest).squeeze(1)
+
+
+def _unknown(best: _Candidates, score: Tensor, scores: Scores) -> Tensor:
     """Coordinates whose widths the stretch says nothing about, (S, n): it is as likely without them.
 
     Coordinates that say the same are needed together, so the least needed ones are left out one after the
     other, as long as the loss of all stays below `LITTLE`.
     """
+    n = best.width.shape[-1]
     alone = torch.eye(n, dtype=torch.bool, device="cpu").expand(
         len(score), -1, -1
     )  # candidate c leaves coordinate c out
-    losses = score[:, None] - _scores(_without(best, alone), samples, n, offsets)
+    losses = score[:, None] - scores(_without(best, alone))
     rank = losses.argsort(1).argsort(1)  # 0 for the least needed
     first = (
         rank[:, None, :] <= torch.arange(n, device="cpu")[:, None]
     )  # candidate c leaves the c + 1 least needed out
-    together = score[:, None] - _scores(_without(best, first), samples, n, offsets)
+    together = score[:, None] - scores(_without(best, first))
     little = (together < LITTLE).long().cumprod(1)
     return little.gather(1, rank).bool()
 
@@ -270,10 +352,10 @@ def _around(best: _Candidates, wide: float, draw: torch.Generator) -> _Candidate
         shape = (1, AROUND, *like.shape[2:])  # for all streams the same, whoever is beside them
         return (wide * torch.randn(shape, generator=draw, dtype=torch.float64, device="cpu")).exp()
 
-    lost = (1 - best.forgetting).clamp(min=1e-4) * factor(best.forgetting)
-    noise = (best.noise * factor(best.noise) ** 2).clamp(min=1e-5)
-    return _Candidates(best.width * factor(best.width), noise, 1 - lost.clamp(max=0.2))
+    lost = (1 - best.forgetting).clamp(min=FADES[0]) * factor(best.forgetting)
+    noise = (best.noise * factor(best.noise) ** 2).clamp(min=LEAST_NOISE)
+    return _Candidates(best.width * factor(best.width), noise, 1 - lost.clamp(max=FADES[1]))
 
 
 def _choose(mask: Tensor, new: Tensor, old: Tensor) -> Tensor:
-    return torch.where(mask.reshape(-1, *[1] * (new.dim() - 1)), new, old)
+    return torch.where(mask.reshape(*mask.shape, *[1] * (new.dim() - mask.dim())), new, old)

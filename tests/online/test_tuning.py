@@ -81,6 +81,21 @@ def test_tuning_knows_no_units_and_is_saved_with_what_was_learned() -> None:
     )
 
 
+@pytest.mark.needs_compiler
+def test_the_gradient_finds_what_is_at_least_as_likely_as_the_best_of_the_search() -> None:
+    pairs = [drawn(torch.tensor([0.7, 0.7]).double(), 0.1, steps=120, seed=seed) for seed in range(2)]
+    x, y = torch.stack([path[:, :1] for path, _ in pairs], 1), torch.stack([told for _, told in pairs], 1)
+    found = [st.StaFRegressor(count=2).tune(x, y, method=how).tuning for how in ("search", "gradient")]
+    assert all(each is not None for each in found)
+    searched, ascended = (each.likelihood for each in found if each is not None)
+    assert bool((ascended > searched - 0.01).all())
+    alone = st.StaFRegressor(count=2).tune(x[:, 1:], y[:, 1:], method="gradient").tuning
+    assert alone is not None
+    torch.testing.assert_close(alone.likelihood, ascended[1:])
+    with pytest.raises(ValueError, match=r"tune\(method=...\)` must be one of .*; got 'newton'"):
+        st.StaFRegressor().tune(x, y, method="newton")
+
+
 def test_a_mixture_has_nothing_to_tune() -> None:
     x, y = drawn(torch.tensor([0.7, 0.7]).double(), 0.1, steps=30)
     model = mixture()
