@@ -57,7 +57,9 @@ def test_wheel_holds_the_package_its_settings_and_nothing_else(wheel: Path) -> N
     sources = {f"staf_torch/{p}" for p in files if p.parts[0] != "plugins"}
     assert not any(name.startswith("staf_torch/plugins") for name in names)  # one copy of each file
     settings = {f"staf_torch/{p.relative_to(ROOT)}" for p in (ROOT / "conf").rglob("*.yaml")}
-    assert sources | settings | {"staf_torch/py.typed"} <= names
+    guides = (ROOT / "staf_torch" / "guides").rglob("*.*")
+    pages = {p.relative_to(ROOT).as_posix() for p in guides} | {"staf_torch/guides/front/README.md"}
+    assert sources | settings | pages | {"staf_torch/py.typed"} <= names
     assert any(name.endswith("LICENSE") for name in names)
 
 

@@ -24,7 +24,7 @@ find_launcher()
 _PARTS = {
     "doctor": "staf_torch.cli.doctor",
     "schema": "staf_torch.cli.schema",
-    "docs": "staf_torch.cli.reference",
+    "docs": "staf_torch.cli.site.build",
 }
 
 

@@ -13,7 +13,7 @@ from .plant_env import OWN_PLANT as OWN_PLANT
 from .plant_env import PLANTS as PLANTS
 from .plant_env import PlantEnv as PlantEnv
 from .plant_env import PlantVectorEnv as PlantVectorEnv
-from .plant_env import register_plants
+from .plant_env import register_plants as register_plants
 
 __all__ = [
     "OWN_PLANT",

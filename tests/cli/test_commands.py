@@ -16,7 +16,7 @@ import pytest
 from sweep_runs import write_run, write_sweep
 
 from staf_torch import __version__
-from staf_torch.cli import doctor, reference, table
+from staf_torch.cli import doctor, table
 from staf_torch.cli.staf import main
 from staf_torch.results.build import source
 
@@ -62,12 +62,6 @@ def test_the_doctor_says_where_the_problem_is(
     (line,) = [line for line in capsys.readouterr().out.splitlines() if "<- problem" in line]
     assert line.startswith("runs:")
     assert "not a folder" in line
-
-
-def test_pages_are_made_of_this_package_alone() -> None:
-    pytest.importorskip("pdoc")  # whose pages are in tests/test_public_names.py
-    with pytest.raises(ValueError, match=r"`staf docs FOLDER MODULE \.\.\.` takes modules of"):
-        reference.main(["a", "b"])
 
 
 CODE = "import os, sys, staf_torch.cli; print(os.environ['OMP_WAIT_POLICY'], 'torch' in sys.modules)"

@@ -1,0 +1,169 @@
+"""The pages of the site: manuals and guides as they lie in the repository, and a page for each public name.
+
+A page keeps its place in the tree, so that its links stay as they are. What a wheel lacks (tests, benchmarks,
+pictures of examples) is not shown there: a link to it becomes text.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+
+from .names import PACKAGE, ROOMS, Name, public_names
+
+_CHECKOUT = PACKAGE.parent
+_FRONT = PACKAGE / "guides" / "front"
+"""In a wheel: README.md, CHANGELOG.md and the pictures of both."""
+_FENCE = re.compile(r"^(```.*?^```$)", re.DOTALL | re.MULTILINE)
+_LINK = re.compile(r"(!?)\[((?:[^][]|\[[^][]*\])*)\]\(([^()\s]+)\)")
+_MANUALS = ("README.md", "CHANGELOG.md", "runs/README.md", "tests/README.md", "tests/benchmarks")
+
+
+def source_file(place: str) -> Path | None:
+    """Return the file of a place in the repository, also where the package is installed from a wheel."""
+    inside = place.removeprefix("staf_torch/")
+    tries = [_CHECKOUT / place] if (_CHECKOUT / "pyproject.toml").is_file() else [_FRONT / place]
+    tries += [PACKAGE / inside]
+    return next((file for file in tries if file.is_file()), None)
+
+
+def manuals() -> list[str]:
+    """Return the places of all manuals and guides that are installed."""
+    found = [f"staf_torch/{path.relative_to(PACKAGE).as_posix()}" for path in PACKAGE.rglob("*.md")]
+    found = [place.replace("staf_torch/conf/", "conf/") for place in found if "/front/" not in place]
+    if (_CHECKOUT / "pyproject.toml").is_file():
+        found += ["conf/README.md", *_of_checkout()]
+    return sorted({*found, "README.md", "CHANGELOG.md"})
+
+
+def _of_checkout() -> Iterator[str]:
+    for place in ("runs/README.md", "tests"):
+        files = [_CHECKOUT / place] if place.endswith(".md") else (_CHECKOUT / place).rglob("*.md")
+        yield from (path.relative_to(_CHECKOUT).as_posix() for path in files)
+
+
+def write_pages(folder: Path, rooms: tuple[str, ...]) -> None:
+    """Write all pages as Markdown into a folder, with the pictures and files that they link to."""
+    places = manuals()
+    for place in places:
+        file = source_file(place)
+        assert file is not None, place
+        text = _linked(file.read_text(encoding="utf-8"), place, places, folder)
+        _write(folder / ("front.md" if place == "README.md" else place), text)
+    _write(folder / "index.md", _beginning(places, folder))
+    for room in rooms:
+        _write_room(folder / "reference", room)
+    _write(folder / "reference" / "index.md", _overview(rooms))
+
+
+def _write(file: Path, text: str) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(text, encoding="utf-8")
+
+
+def _beginning(places: list[str], folder: Path) -> str:
+    """Return the first page: the sentence and the moving picture, the tasks, then how to install and try."""
+    front, tasks = source_file("README.md"), source_file("staf_torch/guides/README.md")
+    assert front is not None
+    assert tasks is not None
+    head, _, rest = front.read_text(encoding="utf-8").partition("\n## ")
+    install = "## " + rest.partition("\n## ")[0]
+    list_of_tasks = tasks.read_text(encoding="utf-8").partition("\n")[2]
+    parts = [
+        _linked(head, "README.md", places, folder),
+        "## What do you want to do?\n",
+        _linked(list_of_tasks, "staf_torch/guides/README.md", places, folder, at=""),
+        _linked(install, "README.md", places, folder),
+    ]
+    return "\n\n".join(parts)
+
+
+def _linked(text: str, place: str, places: list[str], folder: Path, at: str | None = None) -> str:
+    """Return a page with links as they are on the site; files that it links to are copied there.
+
+    Args:
+        text: of the page.
+        place: where it lies in the repository.
+        places: those of all pages.
+        folder: of the site's pages.
+        at: the folder of the page on the site, where it is another one.
+    """
+    home = PurePosixPath(place).parent.as_posix()
+    shown_at = home if at is None else at
+
+    def link(found: re.Match[str]) -> str:
+        picture, words, target = found.groups()
+        if "://" in target or target.startswith(("#", "mailto:")):
+            return found[0]
+        path, _, anchor = target.partition("#")
+        there = os.path.normpath(f"{home}/{path}").replace(os.sep, "/")
+        if there not in places and not _copied(there, folder):
+            return words
+        there = "front.md" if there == "README.md" else _shown(there)
+        shown = os.path.relpath(there, shown_at or ".").replace(os.sep, "/")
+        return f"{picture}[{words}]({shown}{'#' + anchor if anchor else ''})"
+
+    parts = _FENCE.split(text)
+    return "".join(part if part.startswith("```") else _LINK.sub(link, part) for part in parts)
+
+
+def _copied(place: str, folder: Path) -> bool:
+    file = source_file(place)
+    if file is None:
+        return False
+    copy = folder / _shown(place)
+    copy.parent.mkdir(parents=True, exist_ok=True)
+    copy.write_bytes(file.read_bytes())
+    return True
+
+
+def _shown(place: str) -> str:
+    """Return where a file is on the site: folders that begin with a dot are not published."""
+    return place.replace(".assets/", "assets/pictures/")
+
+
+# --- reference ----------------------------------------------------------------------------------------------
+
+
+def _overview(rooms: tuple[str, ...]) -> str:
+    lines = [
+        "# Reference",
+        "",
+        "Every public name has a page: formula, arguments, errors, an example, its source.",
+        "",
+    ]
+    lines += ["| room | what is in it |", "|---|---|"]
+    lines += [f"| [{room}]({room}/index.md) | {ROOMS[room]} |" for room in rooms]
+    return "\n".join(lines) + "\n"
+
+
+def _write_room(folder: Path, room: str) -> None:
+    names = public_names(room)
+    title = ROOMS[room]
+    lines = [f"# {room}", "", f"{title[0].upper()}{title[1:]}."]
+    if source_file(f"staf_torch/{room}/README.md"):
+        lines[-1] += f" The manual: [{room}](../../staf_torch/{room}/README.md)."
+    lines += ["", "| name | |", "|---|---|"]
+    lines += [f"| [`{each.name}`]({each.name}.md) | {_cell(each.summary)} |" for each in names]
+    _write(folder / room / "index.md", "\n".join(lines) + "\n")
+    for each in names:
+        _write(folder / room / f"{each.name}.md", _page(room, each))
+
+
+def _cell(summary: str) -> str:
+    return summary.replace("|", "\\|")
+
+
+def _page(room: str, name: Name) -> str:
+    return f"""---
+title: {name.name}
+search:
+  boost: 2
+---
+
+[Reference](../index.md) / [{room}](index.md) / `from {name.source} import {name.name}`
+
+::: {name.home}.{name.name}
+"""
