@@ -14,7 +14,7 @@ import pytest
 
 EXTRAS = {
     **{"adp": "scipy", "tables": "pyarrow", "tensorboard": "tensorboard", "onnx": "onnx", "rivals": "casadi"},
-    **{"gym": "gymnasium", "mujoco": "mujoco", "docs": "pdoc"},
+    **{"gym": "gymnasium", "mujoco": "mujoco", "docs": "mkdocs"},
 }
 _TOOLS = ("jsonschema", "pandas", "onnxscript", "onnxruntime")  # of the extra `dev`, imported by tests alone
 _HINT = re.compile(r"staf_torch\[(\w+)\]")

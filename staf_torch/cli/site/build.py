@@ -1,8 +1,8 @@
 """`staf docs [FOLDER [ROOM ...]]`: the site of guides, manuals and reference pages (extra `docs`).
 
-mkdocs-material with mkdocstrings: docstrings here are Markdown with sections in Google's style, which both read
-as they are (Sphinx would take `|x|`, `x_` and single backticks for marks of its own); the source is read and not
-imported, so that no text of torch's base classes can appear; neither search nor theme needs a server.
+mkdocs-material with mkdocstrings: docstrings here are Markdown with sections in Google's style, which both
+read as they are (Sphinx would take `|x|`, `x_` and single backticks for marks of its own); the source is read
+and not imported, so that no text of torch's base classes can appear; search and theme need no server.
 """
 
 from __future__ import annotations
