@@ -68,7 +68,7 @@ def asked(path: Path) -> object:
 
 @pytest.mark.parametrize("path", [asked(p) for p in [README, *MANUALS] if any(guides.blocks(p, ("python",)))])
 def test_blocks_of_a_page_run_one_after_another(
-    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.chdir(tmp_path)
     if path.parent.name == "deploy" and not compiler.compiler():
@@ -80,6 +80,7 @@ def test_blocks_of_a_page_run_one_after_another(
     guides.run_page(path)
     assert (tmp_path / f"{path.stem}.png").exists(), "a guide ends with a picture that its reader gets"
     assert f"](pictures/{path.stem}.webp)" in read(path)
+    assert "runs in plain torch" not in caplog.text
 
 
 # --- the front page -----------------------------------------------------------------------------------------

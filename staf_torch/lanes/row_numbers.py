@@ -162,6 +162,9 @@ def some_rows(chosen: Tensor | None) -> Iterator[None]:
 
     With None they hold all of them, whatever was chosen outside.
     """
+    if not RowNumbers.made:  # nor does `points_of_rows` choose any: inside it are more rows than outside
+        yield
+        return
     before = getattr(_active, "chosen", None)
     _active.chosen = chosen if before is None or chosen is None else before[chosen.to(before.device)]
     try:
