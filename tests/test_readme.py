@@ -168,7 +168,7 @@ def test_files_and_tests_that_pages_name_exist() -> None:
 
 def commands(path: Path, program: str) -> list[str]:
     """Command lines of a program: in `code` of the text, and in blocks for the terminal."""
-    text = read(path)
+    text = re.sub(r"\\\n\s*", "", read(path))  # lines that go on
     blocks = re.findall(r"^```(?:text|bash)?\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
     inline = re.findall(r"`([^`\n]+)`", without_blocks(text))
     lines = [re.sub(r"(^|\s)#.*", "", line) for block in blocks for line in block.splitlines()]
