@@ -158,7 +158,7 @@ def differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str
 
 
 def short(build: Mapping[str, Any]) -> str:
-    """Return a build as a table names it: `0.1.0 source 3f2a91b0c4d5 torch 2.13.0 other 4a5b6c`."""
+    """Return a build as a table names it: `0.2.0 source 3f2a91b0c4d5 torch 2.13.0 other 4a5b6c`."""
     text = f"{build.get('version')} source {build.get('source')} torch {build.get('torch')}"
     rest = json.dumps([build.get("compiler"), build.get("modules")], sort_keys=True)
     return f"{text} other {hashlib.sha256(rest.encode()).hexdigest()[:6]}"
