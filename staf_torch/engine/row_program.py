@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from ..approximation.basis import GramStructure, StaFBasis, Target
 from ..lanes import Program
-from ..lanes.call import served
+from ..lanes.call import say_transformed, served
 from ..lanes.compiled_methods import worth
 from ..lanes.shared_programs import SharedPrograms
 from ..optim.base import UpdateLaw
@@ -151,7 +151,10 @@ def program(problem: Problem, states: Tensor, carry: RowCarry, *, everything: bo
         carry: what it starts from.
         everything: whether all results are wanted, or the weights alone.
     """
-    if not worth(states.shape[1] >= SHORTEST) or not served((states, carry.chase.weights)):
+    if not worth(states.shape[1] >= SHORTEST):
+        return None
+    if not served((states, carry.chase.weights)):
+        say_transformed("the chase")
         return None
     settings = settings_of(problem, states, everything)
     owners = problem.basis, problem.target, problem.law, problem.predictor, *settings

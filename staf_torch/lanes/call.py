@@ -20,6 +20,7 @@ from torch.autograd import forward_ad
 
 from ..signs import Sign
 from .compiler import compiled
+from .log import say
 from .row_numbers import RowNumbers, columns
 from .tree import Shared, Tree, flatten, labels, plain, unflatten
 
@@ -126,11 +127,21 @@ def _one_device(leaves: Sequence[Any], recorded: bool) -> Where:
 
 def seen_by_others() -> bool:
     """Return whether a tracer, a transform of torch.func or forward mode looks at the operations."""
-    return (
-        torch._C._functorch.peek_interpreter_stack() is not None
-        or forward_ad._current_level >= 0
-        or torch._C._len_torch_dispatch_stack() > 0
-    )
+    return transformed() or torch._C._len_torch_dispatch_stack() > 0
+
+
+def transformed() -> bool:
+    """Return whether a transform of torch.func or forward mode looks at the operations."""
+    return torch._C._functorch.peek_interpreter_stack() is not None or forward_ad._current_level >= 0
+
+
+def say_transformed(name: str) -> None:
+    """Log once that a transform keeps a program in plain torch, where one looks and nobody traces."""
+    if transformed() and not torch._C._len_torch_dispatch_stack():
+        say(
+            name,
+            "a transform of `torch.func` (vmap, jacrev, grad, ...) or forward mode looks at what it does",
+        )
 
 
 _TENSORS = (Tensor, torch.nn.Parameter)

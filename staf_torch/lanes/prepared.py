@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from .adjoint import GradientCall
-from .call import Given, PlannedCall, Where, form, ordinary, seen_by_others, whole
+from .call import Given, PlannedCall, Where, form, ordinary, say_transformed, seen_by_others, whole
 from .device.kernel import DeviceCall
 from .log import say
 from .opaque import opaque
@@ -91,6 +91,8 @@ class Prepared:
             found = self._gradient(leaves)
             if found is not None:
                 return found
+        if self._program.compile:
+            say_transformed(self._program.name)
         return self._program.definition(carry, now, row, steps=self._steps, every=self._every)
 
     def _planned(self, given: Given, leaves: Sequence[Any], where: Where) -> Plan | None:

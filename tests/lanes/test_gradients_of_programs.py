@@ -46,7 +46,7 @@ def inputs() -> tuple[Tree, Tree, Tree]:
     return (x, torch.zeros(ROWS, dtype=torch.int64)), (u, Shared(wind)), (mass, Shared(push))
 
 
-EVERYTHING = lanes.Program(everything)
+EVERYTHING = lanes.Program(everything, name="everything")
 
 
 def gradients(
@@ -140,6 +140,7 @@ def test_where_nobody_asks_for_it_there_is_none_and_a_checkpoint_has_it() -> Non
     torch.testing.assert_close(found, torch.autograd.grad(EVERYTHING(*given)[0][0].sum(), x)[0])
 
 
+@pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")  # of torch's forward mode
 def test_derivatives_of_derivatives_and_transforms_are_those_of_the_definition(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -154,7 +155,18 @@ def test_derivatives_of_derivatives_and_transforms_are_those_of_the_definition(
     assert "a derivative of a derivative is wanted" in caplog.text
     pushed = functools.partial(EVERYTHING, now=now, row=row)
     energy = lambda at: pushed((at, count))[0][0].square().sum()  # noqa: E731
-    torch.testing.assert_close(torch.func.grad(energy)(x.detach()), torch.autograd.grad(energy(x), x)[0])
+    (slope,), at = torch.autograd.grad(energy(x), x), x.detach()
+    assert "vmap, jacrev" not in caplog.text
+    torch.testing.assert_close(torch.func.grad(energy)(at), slope)
+    assert "everything runs in plain torch, slower: a transform of `torch.func` (vmap, jacrev" in caplog.text
+    torch.testing.assert_close(torch.func.jacrev(energy)(at), slope)
+    along = torch.ones_like(at)
+    with torch.autograd.forward_ad.dual_level():
+        dual = torch.autograd.forward_ad.make_dual(at, along)
+        torch.testing.assert_close(torch.autograd.forward_ad.unpack_dual(energy(dual)).tangent, slope.sum())
+    both = torch.func.vmap(energy)(torch.stack((at, 2 * at)))
+    torch.testing.assert_close(both, torch.stack((energy(at), energy(2 * at))))
+    assert caplog.text.count("runs in plain torch") == 2  # a line for each reason
 
 
 def corners(x: Tensor, u: Tensor, _: Tree) -> tuple[Tensor, Tree]:
