@@ -39,7 +39,7 @@ from .loop.controller import LQR as LQR
 from .loop.controller import Controller as Controller
 from .loop.controller import Feedback as Feedback
 from .loop.controller import Supervised as Supervised
-from .loop.simulation import LoopResult as LoopResult
+from .loop.result import LoopResult as LoopResult
 from .loop.simulation import simulate as simulate
 from .near_optimal import near_optimal as near_optimal
 from .planning.ddp import BoxDDP as BoxDDP

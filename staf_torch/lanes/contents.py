@@ -257,7 +257,7 @@ def number(place: int, value: float) -> Tensor:
     return torch.tensor(value, dtype=torch.float64, device="cpu")
 
 
-class _Names(dict[torch.dtype, str]):
+class _DtypeNames(dict[torch.dtype, str]):
     """Names of dtypes, which torch spells anew each time."""
 
     def __missing__(self, dtype: torch.dtype) -> str:
@@ -265,7 +265,7 @@ class _Names(dict[torch.dtype, str]):
         return name
 
 
-_NAMES = _Names()
+_NAMES = _DtypeNames()
 
 
 class _Same:

@@ -127,6 +127,11 @@ def in_use() -> bool:
     return RowNumbers.made and getattr(_active, "resolve", None) is None
 
 
+def anybodys() -> bool:
+    """Return whether nobody has said whose numbers of rows are meant, nor of which rows a batch consists."""
+    return getattr(_active, "resolve", None) is None and getattr(_active, "chosen", None) is None
+
+
 def nonzero(number: Any) -> bool:
     """Return whether a number is not 0; numbers of rows count as such, as a row may have another."""
     return isinstance(number, RowNumbers) or bool(number)

@@ -19,7 +19,7 @@ from ..problem.cost import Cost
 from .controller import LQR, Controller, Feedback
 
 if TYPE_CHECKING:
-    from .simulation import LoopResult
+    from .result import LoopResult
 
 _log = logging.getLogger(__name__)
 _DRAWN = 8  # rows

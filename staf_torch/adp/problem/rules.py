@@ -79,7 +79,7 @@ def own_period(call: str, plant: Plant, dt: float | None) -> float:
     return held_period(call, plant, dt)
 
 
-def check_within(call: str, argument: str, bounds: Bounds | None, u: Tensor) -> None:
+def check_within(call: str, argument: str, bounds: Bounds | None, u: Tensor) -> bool:
     """Refuse bounds that do not contain the input which holds the plant at the set-point.
 
     Args:
@@ -88,11 +88,14 @@ def check_within(call: str, argument: str, bounds: Bounds | None, u: Tensor) -> 
         bounds: of the inputs, None for none.
         u: the input, (m,).
 
+    Returns:
+        False where it lies on a bound, of which a warning in the log tells.
+
     Raises:
-        ValueError: if it lies outside; a warning in the log if it lies on a bound.
+        ValueError: if it lies outside.
     """
     if bounds is None:
-        return
+        return True
     bounds = bounds.on(u.device)
     if not bool(bounds.contain(u)):
         low, high = bounds.low.tolist(), bounds.high.tolist()
@@ -104,6 +107,8 @@ def check_within(call: str, argument: str, bounds: Bounds | None, u: Tensor) -> 
             "can push one way only.",
             *(call, u.tolist(), bounds.low.tolist(), bounds.high.tolist()),
         )
+        return False
+    return True
 
 
 def regulated(call: str, plant: Plant, cost: Cost, argument: str = "cost") -> Cost:
@@ -171,27 +176,31 @@ def restless(plant: Plant, cost: Cost) -> str:
     return ""
 
 
-def warn_if_restless(call: str, plant: Plant, cost: Cost) -> None:
+def warn_if_restless(call: str, plant: Plant, cost: Cost) -> bool:
     """Say in the log that nothing holds a plant at the set-point of a cost, which is paid for ever then.
 
     Nothing is said of an economic cost, which has no set-point.
+
+    Returns:
+        Whether nothing had to be said.
     """
     try:
         check_regulates(call, plant, cost)
     except ValueError:
-        return
+        return True
     try:
-        _check_held(call, plant, cost, "cost")
+        return _check_held(call, plant, cost, "cost")
     except ValueError as error:
         _log.warning("`%s`: nothing holds the plant at the set-point: %s", call, error)
+        return False
 
 
-def _check_held(call: str, plant: Plant, placed: Cost, argument: str) -> None:
-    """Refuse a set-point at which no input within the bounds holds the plant."""
+def _check_held(call: str, plant: Plant, placed: Cost, argument: str) -> bool:
+    """Refuse a set-point at which no input within the bounds holds the plant; as `check_within`."""
     still_plant, still = placed.regulated(plant)
     x, u = set_point(still_plant, still)
     check_rest(still_plant, x, u)
-    check_within(call, argument, placed.bounds, u)
+    return check_within(call, argument, placed.bounds, u)
 
 
 def slowest(policy: Callable[[Tensor], Tensor], plant: Plant, cost: Cost, period: float) -> float:
@@ -217,13 +226,16 @@ def warn_if_short(call: str, argument: str, horizon: float, decay: float) -> Non
         )
 
 
-def warn_if_unstable(policy: Callable[[Tensor], Tensor], plant: Plant, cost: Cost, dt: float) -> float:
+def warn_if_unstable(
+    policy: Callable[[Tensor], Tensor], plant: Plant, cost: Cost, dt: float
+) -> tuple[float, bool]:
     """Say in the log that the linearised loop of a policy held for dt is not stable, and which period is.
 
     Where rows have numbers of their own it is some of them that are looked at.
 
     Returns:
-        The fastest mode of the linearised plant without control, 1/s; inf where it is not known.
+        The fastest mode of the linearised plant without control, 1/s, inf where it is not known; and whether
+        the loop is stable.
     """
 
     def loop() -> HeldLoop:
@@ -239,11 +251,11 @@ def warn_if_unstable(policy: Callable[[Tensor], Tensor], plant: Plant, cost: Cos
         fastest, radii = float(fast.max()), radii.nan_to_num(-1.0, math.inf)
         radius = float(radii.max())
         if not radius >= 1:
-            return fastest
+            return fastest, True
         held = found.of(int(radii.argmax()), loop)
     except (RuntimeError, ValueError) as error:  # a loop runs where nobody can say whether it is stable
         _log.info("whether the linearised loop is stable was not looked at: %s", error)
-        return math.inf
+        return math.inf, False
     most = held.largest_period()
     remedy = "at no period" if most is None else f"up to {most:.4g} s"
     made = getattr(policy, "period", None)
@@ -257,4 +269,4 @@ def warn_if_unstable(policy: Callable[[Tensor], Tensor], plant: Plant, cost: Cos
         "is unstable; it is stable %s. %s",
         *(dt, radius, remedy, advice),
     )
-    return fastest
+    return fastest, False

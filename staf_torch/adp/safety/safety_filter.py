@@ -19,7 +19,7 @@ from ...numerics.shown import limits, shown
 from ...systems import Bounds, Plant
 from ...systems.bounds import Limit
 from ..loop.controller import Carried, Controller, Feedback, Policy
-from ..loop.simulation import LoopResult
+from ..loop.result import LoopResult
 from ..problem.shapes import check_plant
 from .conditions import Conditions, Constraint, Lean, check_traceable, listed
 from .look_ahead import LookAhead
