@@ -15,8 +15,8 @@ from torch import Tensor
 from ..adp import Controller, Feedback, LoopResult, RolloutPolicy
 from ..adp.loop.setup import AdpProblem
 from ..adp.planning.shooting.reference_optimum import optimal_cost
-from ..figures.closed_loop import draw_comparison
-from ..figures.style import draws
+from ..figures.closed_loop import draw_comparison, draw_initial_weights
+from ..figures.style import draws, images
 from ..metrics.closed_loop import comparison_row, regulated
 from ..numerics.checks import COMMAND_LINE, fail, positive_real, vector
 from ..results.progress import SHOWN, Progress
@@ -133,12 +133,14 @@ def initial_weights(cfg: DictConfig, directory: Path, progress: Progress = SHOWN
     headings = [*(f"W0 = {w:g}" for w in weights), "all"]
     metrics: Metrics = {}
     table: list[dict[str, str]] = []
+    found: dict[str, list[float]] = {}
     for name, changes in _LAWS.items():
         problem = _from_weights(variant(cfg, changes), weights, cfg.adp.actor / cfg.adp.critic)
         result = solve(problem, progress)
         shares = (
             regulated(result, _final(problem, result)).double().reshape(len(weights), -1).mean(-1).tolist()
         )
+        found[name] = shares
         overall, diverged = sum(shares) / len(shares), float(result.diverged.double().mean())
         metrics |= {f"{name}_regulated_W{w:g}": share for w, share in zip(weights, shares, strict=True)}
         metrics |= {f"{name}_regulated_fraction": overall, f"{name}_diverged_fraction": diverged}
@@ -150,6 +152,8 @@ def initial_weights(cfg: DictConfig, directory: Path, progress: Progress = SHOWN
         )
     out = RunDirectory(directory)
     out.table(cfg.task, Table.of(table))
+    if draws(cfg.figures):
+        out.figure(cfg.task, images(draw_initial_weights(weights, found)))
     return out.metrics(metrics)
 
 

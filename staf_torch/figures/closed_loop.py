@@ -164,6 +164,19 @@ def draw_comparison(ratios: Mapping[str, np.ndarray]) -> Figure:
     return figure
 
 
+def draw_initial_weights(weights: Sequence[float], found: Mapping[str, Sequence[float]]) -> Figure:
+    """The share of initial states that each law regulates, against the initial weight of the critic."""
+    order = np.argsort(weights)
+    with panels(1, 1, high=2.2) as (figure, (axes,)):
+        for i, (name, values) in enumerate(found.items()):
+            look = {"linestyle": dash(i), "color": colour(i), "marker": marker(i), "label": name}
+            axes.plot(np.asarray(weights)[order], np.asarray(values)[order], markersize=4, **look)
+        axes.set(xlabel=r"initial critic weights $\hat W_c(0)$, all alike", ylim=(-0.02, 1.02))
+        axes.set_ylabel("share of initial states regulated")
+        legend(axes)
+    return figure
+
+
 def draw_tracking(history: TrackingHistory) -> Figure:
     """State against desired state, |e| of every variant, theta^ against theta, critic weights."""
     with panels(4) as (figure, grid):

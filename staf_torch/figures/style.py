@@ -58,6 +58,7 @@ _DASHES: tuple[Any, ...] = (
 )  # dotted is what is ideal, true or wanted
 _PANEL = 2.2  # inches that a panel is wide, at least, with type of 8 pt
 _ROUNDING = 1e-6  # of the numbers at an axis: less is no difference
+_SHORT = 16.0  # ratio of the ends of a logarithmic axis that names more than its decades
 _ROOM = 0.12  # of an axis, between two numbers on it
 _HIGHEST = 9.0  # inches of all panels: a page
 _STRIP, _TALL = 1.35, 2.0  # inches that it is high, in one column and in several
@@ -188,6 +189,7 @@ def page(height: float) -> Iterator[Figure]:
             engine = figure.get_layout_engine()
             assert engine is not None
             _widen_the_constant(figure)
+            _short_decades(figure)
             _label_the_lowest(figure)
             engine.execute(figure)
             if sum(map(place, wanted)) or any(axes.get_aspect() != "auto" for axes in figure.axes):
@@ -281,6 +283,27 @@ def _widen_the_constant(figure: Figure) -> None:
         largest = max(abs(low), abs(high))
         if axes.get_yscale() == "linear" and high - low < _ROUNDING * largest:
             axes.set_ylim(low - 0.05 * largest, high + 0.05 * largest)
+
+
+def _short_decades(figure: Figure) -> None:
+    """Name 1, 2 and 5 of each decade on a short logarithmic axis, plainly: matplotlib's names overlap."""
+    from matplotlib.ticker import FuncFormatter, LogFormatterSciNotation
+
+    def digit(value: float) -> str:
+        return f"{value:e}"[0]
+
+    for axes in figure.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            low, high = sorted(map(abs, axis.get_view_interval()))
+            short = axis.get_scale() == "log" and 1e-4 <= low <= high <= min(_SHORT * low, 1e5)
+            if not short or not isinstance(axis.get_minor_formatter(), LogFormatterSciNotation):
+                continue
+            inside = [digit(at) for at in axis.get_ticklocs(minor=True) if low <= at <= high]
+            inside += [digit(at) for at in axis.get_ticklocs() if low <= at <= high]
+            wanted = "125" if sum(at in "125" for at in inside) > 1 else "123456789"
+            names = FuncFormatter(lambda at, _, wanted=wanted: f"{at:g}" if digit(at) in wanted else "")
+            axis.set_major_formatter(names)
+            axis.set_minor_formatter(names)
 
 
 def _label_the_lowest(figure: Figure) -> None:

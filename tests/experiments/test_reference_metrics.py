@@ -62,8 +62,7 @@ def test_a_run_leaves_a_figure_with_named_axes_and_tells_its_progress(name: str)
         pytest.importorskip("scipy", reason="needs the extra adp")
     result = ran(name)
     drawn = {path.stem for path in (result.directory / "figures").iterdir()} if result.figures else set()
-    expected = set() if name == "adp_initial_weights" else {name.split()[0]}
-    assert drawn == expected
+    assert drawn == {name.split()[0]}
     for figure in result.figures:
         for axes in (axes for axes in figure.axes if axes.get_visible() and axes.get_label() != "<legend>"):
             shared = axes.get_shared_x_axes().get_siblings(axes)
