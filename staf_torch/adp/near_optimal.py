@@ -288,7 +288,7 @@ class NearOptimal(SampledRollout):
 
     @property
     def _has_optimum(self) -> bool:
-        """Whether direct shooting takes the problem."""
+        """Return whether direct shooting takes the problem."""
         return self.plant.period is None and self.plant.traceable and not self.cost.discount
 
     def _microseconds(self, x: Tensor) -> float:

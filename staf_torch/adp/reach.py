@@ -1,4 +1,4 @@
-"""How far a held feedback leads, on a sample of the box around the goal, and a value for all of that box."""
+"""The reach of a held feedback, on a sample of the box around the goal, and a value for all of that box."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _GOOD = 1.02  # mean cost over the best known, beyond which the log warns
 
 
 class Reach(NamedTuple):
-    """How far a policy leads from the states of a box around its set-point."""
+    """The reach of a policy: how many states of a box around its set-point it regulates, and at what cost."""
 
     way: str  # ``local``: the LQR and its rollouts; ``global``: a memory of optimal trajectories
     box: tuple[float, ...]  # half widths, in units of the state
@@ -59,7 +59,7 @@ def sample(cost: Cost, width: Tensor) -> Tensor:
 
 
 def arrived(cost: Cost, x: Tensor, x0: Tensor) -> Tensor:
-    """Whether states (B, n) are within 1 % of where they began, (B,) bool."""
+    """Return whether states (B, n) are within 1 % of where they began, (B,) bool."""
     left, began = cost.deviation(x).norm(dim=-1), cost.deviation(x0).norm(dim=-1)
     close: Tensor = torch.isfinite(left) & (left <= REGULATED * began)
     return close
@@ -68,7 +68,7 @@ def arrived(cost: Cost, x: Tensor, x0: Tensor) -> Tensor:
 def extended(
     policy: SampledRollout, lqr: LQR, box: Tensor, settles: int, way: str
 ) -> tuple[Reach, GlobalValue | None]:
-    """How far a base leads and, where that is not enough, a global value; the log says what is left.
+    """Return the reach of a base and, where that is not enough, of a global value; log what is left.
 
     Args:
         policy: with the base.
@@ -116,7 +116,7 @@ def extended(
 
 
 def _judged(memory: GlobalValue, cost: Cost, x0: Tensor, base: Followed, box: Tensor) -> Reach:
-    """How far a global value leads from x0 (B, n)."""
+    """Return the reach of a global value from x0 (B, n)."""
     share, found = float(base.regulated.double().mean()), compared(memory, cost, x0)
     best = torch.where(base.regulated, torch.minimum(base.cost, found.best), found.best)
     good = found.regulated
@@ -136,7 +136,7 @@ def _shown(box: Tensor) -> str:
 
 
 class Followed(NamedTuple):
-    """Where a base leads."""
+    """The end of trajectories of a base."""
 
     regulated: Tensor  # (B,) bool
     cost: Tensor  # (B,), until all had arrived
@@ -189,7 +189,7 @@ class Compared(NamedTuple):
 
 @torch.no_grad()
 def compared(memory: GlobalValue, cost: Cost, x0: Tensor) -> Compared:
-    """What following a memory costs from x0 (B, n), and the best that is found from its plans."""
+    """Return the cost of following a memory from x0 (B, n), and the best that is found from its plans."""
     problem, steps = memory.problem, memory.length - memory.lookahead - 1
     search = BoxDDP(problem, steps=steps, iterations=40, tolerance=1e-5)
     best = best_from(memory, search, x0).cost

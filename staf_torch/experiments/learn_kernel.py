@@ -39,7 +39,7 @@ _SCALES = ("width", "length_scale")  # what a kernel may call its own
 
 
 class Learning(NamedTuple):
-    """What is learned, and on which states."""
+    """Parameters that are learned, and the states they are learned on."""
 
     problem: ChaseProblem
     kernel: Callable[[Tensor], Kernel]  # of a width or a length scale
@@ -78,7 +78,7 @@ class Learning(NamedTuple):
         return self.squares(width, radius, self.states).mean().sqrt()
 
     def grid(self, widths: Tensor, radii: Tensor, progress: Progress = SHOWN) -> Tensor:
-        """The same at all pairs, (R, W): all radii of a width are rows of one call."""
+        """Return the error at all pairs, (R, W): all radii of a width are rows of one call."""
         batch = self.states.shape[0]
         states = self.states.repeat(len(radii), 1, 1)
         each = rows(radii.repeat_interleave(batch))

@@ -65,7 +65,7 @@ _STRIP, _TALL = 1.35, 2.0  # inches that it is high, in one column and in severa
 
 
 class FigurePaper(NamedTuple):
-    """What a figure is printed on: its width and the type of all its texts."""
+    """The column that a figure is printed in: its width and the type of all its texts."""
 
     width: float = 7.2  # inches: both columns of a paper; one is 3.4
     size: float = 8.0  # pt

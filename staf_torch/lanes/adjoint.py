@@ -65,7 +65,7 @@ def gradient_memory(mebibytes: float) -> Iterator[None]:
 
 
 class Ran(NamedTuple):
-    """What the backward pass of one call must know beside its tensors.
+    """Facts of one call that its backward pass needs beside the tensors.
 
     Args:
         call: that was made.

@@ -23,7 +23,7 @@ from .tree import Shared, Tree, flatten, plain, unflatten
 
 
 class Differentiated(NamedTuple):
-    """What has a gradient, and what one comes from: a flag for every leaf."""
+    """Flags of leaves: which have a gradient, and which one comes from."""
 
     carry: tuple[bool, ...]  # leaves of the next carry that decide what is wanted
     now: tuple[bool, ...]

@@ -229,7 +229,7 @@ class Backward:
         return [x[block].movedim(-1, 0)[:count] for x in kept]
 
     def _rooms(self, rows: slice, times: slice, at_times: _AtTimes) -> list[Tensor]:
-        """Where a block is written to: what times bring has its place among all rows."""
+        """Return the place of a block: outputs of times lie among those of all rows."""
         if not self._on_processor or self.built is None:
             return []
         like, count = at_times.like, rows.stop - rows.start

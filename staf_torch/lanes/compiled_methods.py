@@ -261,7 +261,7 @@ class CompiledMethod:
 
     @property
     def __code__(self) -> CodeType:
-        """Of the definition, for `torch.export`."""
+        """Return the code of the definition, for `torch.export`."""
         return self.definition.__code__
 
     def _defined(self, x: Tensor, *more: Tree) -> Any:

@@ -203,7 +203,7 @@ def _inside(value: Any) -> list[Any]:
 
 
 class _Unserved(torch.autograd.Function):
-    """The same numbers, of which no derivative is known."""
+    """Return the same numbers as an operation without a derivative."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, wanted: Tensor, call: str) -> Tensor:

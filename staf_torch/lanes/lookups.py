@@ -1,4 +1,4 @@
-"""What code looks up by name: globals of its module, attributes of modules and of classes found there."""
+"""Names that code looks up: globals of its module, attributes of modules and of classes found there."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ def _product(word: Tensor, factor: int) -> tuple[Tensor, Tensor]:
 
 
 def _unsigned_product(word: Any, factor: int) -> tuple[Any, Any]:
-    """The same of an array of NumPy, whose 64 bits have no sign: three operations in place of nine."""
+    """Return the product of NumPy arrays, whose 64 bits have no sign: three operations in place of nine."""
     whole = word * np.uint64(factor)
     return whole >> np.uint64(32), whole & np.uint64(_WORD)
 

@@ -297,7 +297,7 @@ class Program(Derived):
         return None if built is None or not self._alone(given) else built.compiled
 
     def built(self, given: Given) -> Built | None:
-        """What was built for such inputs, None where there is nothing."""
+        """Return the code built for such inputs, None where there is none."""
         where = given.ordinary()
         if not self.compile or not where:
             return None
@@ -412,7 +412,7 @@ class Program(Derived):
         return None if again is None else again._replace(followed=True)
 
     def _with_others(self, built: Built, others: Mapping[int, Tensor]) -> Built | None:
-        """What was built with a table of the numbers of other tensors, None where the text is another."""
+        """Return the built code with a table of the numbers of other tensors, None where its text differs."""
         numbers = built.trace.recipe.again(others)
         if numbers is None:
             return None

@@ -33,7 +33,7 @@ _ATOMS = (str, bytes, int, float, complex, bool, type(None), type, ModuleType, t
 
 
 class Alike(NamedTuple):
-    """What a function returned for some of the rows, which decided alike."""
+    """Outputs of a function for rows that decided alike."""
 
     rows: Tensor  # (R,) int64
     found: Any  # with numbers (R, ...) as `RowNumbers`, or those of one row alone
@@ -247,7 +247,7 @@ def _values(tensor: Any, level: int | None = None) -> Tensor | None:
 
 
 class _Place:
-    """Where a tensor of all rows belongs, until it is known."""
+    """Placeholder of a tensor of all rows until its values are known."""
 
     def __init__(self, at: int) -> None:
         self.at = at

@@ -396,7 +396,7 @@ def _decides(error: Exception) -> bool:
 
 
 def _operation(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-    """One operation of numbers of rows outside of a batch: numbers of rows, too."""
+    """Apply an operation to numbers of rows outside of a batch; the result is numbers of rows, too."""
     name = getattr(func, "__name__", "")
     if (
         args
@@ -442,7 +442,7 @@ def _asks_structure(func: Any) -> bool:
 
 
 def _below(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-    """One operation that no Python function of torch has seen (`torch.as_tensor`): `vmap` has no say."""
+    """Apply an operation that no Python function of torch has seen (`torch.as_tensor`), without `vmap`."""
     resolve: Resolve | None = getattr(_active, "resolve", None)
     if resolve is not None:
         args, kwargs = tree_map(lambda x: resolve(x) if isinstance(x, RowNumbers) else x, (args, kwargs))

@@ -196,7 +196,7 @@ def stalls(error: float, last: float) -> bool:
 
 
 class StepsNeeded(NamedTuple):
-    """What rows need."""
+    """Steps and orders that rows need."""
 
     factor: Tensor  # (R,) int64, times the steps
     error: Tensor  # (R,) float64, that is left with them

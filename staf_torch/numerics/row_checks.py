@@ -1,4 +1,4 @@
-"""What a user's function returns, tried with two numbers of rows that are no other size of the problem.
+"""Checks of a user's function by calls with two numbers of rows that are no other size of the problem.
 
 With as many rows as there are states, inputs, centers or walls a function that confuses the two returns the
 right shape and wrong numbers. So it is called with other numbers of rows, and its values are looked at.

@@ -18,7 +18,7 @@ _NUMBERS = torch.finfo(torch.float64)
 
 
 class Forecast(NamedTuple):
-    """What was expected of every sample before it was learned, and how likely it was then."""
+    """Expected value of every sample before it was learned, and its likelihood then."""
 
     mean: Tensor  # in the shape of y
     deviation: Tensor  # standard deviation, noise included; as the mean

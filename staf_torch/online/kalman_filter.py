@@ -142,7 +142,7 @@ class Counts(NamedTuple):
 
 
 class _Outlook(NamedTuple):
-    """What is expected of the next y."""
+    """The expected next y."""
 
     mean: Tensor  # (K, S)
     deviation: Tensor  # (K, S)
@@ -228,7 +228,7 @@ class LocalFilter:
         return mean, torch.where(fresh, ((1 + self.ratio) * self.base).sqrt(), found.deviation)
 
     def _outlook(self, old: StateParts, here: Tensor, z: Tensor, share: Tensor) -> _Outlook:
-        """What is expected of y at z (n, S) from an anchor; when it comes, this share of D is left."""
+        """Return the expected y at z (n, S) from an anchor, and the share of D that is left when it comes."""
         psi, log_factor = self.functions.local(here, z)
         prior = torch.zeros_like(share) + self.functions.prior(here, z)
         factor = torch.ones_like(share) if log_factor is None else log_factor.exp()

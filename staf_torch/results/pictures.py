@@ -1,4 +1,4 @@
-"""What a figure shows of objects of the library, as plain arrays, and who draws it.
+"""Pictures of objects of the library as plain arrays, and the function that draws them.
 
 The library knows no matplotlib: it describes a picture, and `figures` draws it, which the package registers
 here when it is imported.

@@ -1,4 +1,4 @@
-"""What is said of a setting that is not there: which choice has it, or which name is near."""
+"""Messages about a setting that does not exist: which choice has it, or which name is near."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ class FunctionPlant(Plant):
         return self.function.torch
 
     def in_torch(self, x: Tensor, u: Tensor) -> Self | None:
-        """The same plant with a function that torch follows through NumPy, itself where it is torch already.
+        """Return the plant with a function that torch follows through NumPy, or itself if it is torch.
 
         Args:
             x: states at which the two must agree to rounding, (B, n).

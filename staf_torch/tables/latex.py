@@ -54,7 +54,7 @@ _DECIMAL = range(-2, 4)  # powers of ten that are written out
 
 @dataclasses.dataclass(frozen=True)
 class Print:
-    """What stands around a table on a page.
+    """The frame of a printed table: caption, label, splitting, notes.
 
     Example:
         >>> Print(caption="Errors.", label="tab:errors").label

@@ -194,6 +194,6 @@ class RobustFilter(Controller):
 
 
 def _kept(rows: Tensor, before: Carried, after: Carried) -> Carried:
-    """What was carried before in ``rows`` (B,), what is carried after in the others."""
+    """Return the carry of before in ``rows`` (B,), that of after in the others."""
     (old, _), (new, structure) = flatten(before), flatten(after)
     return unflatten(structure, iter(chosen(rows, tuple(old), tuple(new))))

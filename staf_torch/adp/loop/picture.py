@@ -29,7 +29,7 @@ _ZERO = 1e-9  # of the largest state: a set-point that is not drawn
 
 @dataclasses.dataclass(frozen=True)
 class LoopAbout:
-    """What ran: words, units and bounds, and what a picture computes with: that stays behind in a pickle."""
+    """The loop in words, units and bounds; what its picture computes with stays out of a pickle."""
 
     plant: str
     controller: str

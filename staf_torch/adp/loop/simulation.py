@@ -161,7 +161,7 @@ def _beginning(loop: ClosedLoop, plain: Program, steps: int) -> LoopProgram:
 
 @dataclasses.dataclass(frozen=True)
 class _LoopRun:
-    """What `simulate` runs, again for some rows with other steps."""
+    """The loop of `simulate`, run again for some rows with other steps."""
 
     x0: Tensor
     steps: int

@@ -36,7 +36,7 @@ _SEVERAL = 1 / 3  # of the edges tried, on which brakes that cannot hold h make 
 
 
 class Lean(NamedTuple):
-    """What moves a constraint at a state: its last derivative before the inputs, and what they add."""
+    """The rate of a constraint at a state: its last derivative before the inputs, and what they add."""
 
     value: Tensor  # h - margin, (B, k)
     rate: Tensor  # h' at the resting input, 0 where the degree is one
@@ -64,7 +64,7 @@ class Ends(NamedTuple):
 
 
 class Conditions(nn.Module):
-    """What a held control must satisfy to keep h_i(x, t) >= margin_i, one row and constraint at a time.
+    """Conditions on a held control that keep h_i(x, t) >= margin_i, one row and constraint at a time.
 
     Args:
         plant, constraints, bounds, hold, decay, degree, margin: as in `SafetyFilter`.
@@ -301,7 +301,7 @@ class Conditions(nn.Module):
 
 
 class _Brakes(NamedTuple):
-    """What the inputs can do for every constraint, found at states around the equilibrium."""
+    """The authority of the inputs over every constraint, found at states around the equilibrium."""
 
     constant: tuple[float | None, ...]  # the largest h'' where it is the same everywhere, positive and finite
     usual: tuple[float | None, ...]  # what the inputs can add a unit of the gradient; None without bounds

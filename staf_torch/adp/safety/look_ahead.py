@@ -1,4 +1,4 @@
-"""What becomes of a state after a hold: can the brakes stop it inside, or the policy bring it back inside?
+"""A state after a hold: can the brakes stop it inside, or the policy bring it back inside?
 
 A condition of one hold says nothing of the next ones where bounds limit the inputs. Here the hardest brake is
 followed until nothing comes nearer to its edge; of double integrators that is v^2 <= 2 a h. Where braking
@@ -32,7 +32,7 @@ _NEVER = 1e6  # s, for which what no brake slows goes on
 
 
 class Opposed(NamedTuple):
-    """What braking along an edge does to the rest of the plant, linearised at the equilibrium."""
+    """The rest of the plant under braking along an edge, linearised at the equilibrium."""
 
     rate: Tensor  # (k,) 1/s, of the fastest growth; at most 0 where nothing runs away
     alone: float | None  # 1/s, of the slowest mode under the policy alone; None where it is not known

@@ -391,7 +391,7 @@ class SafetyFilter(Controller):
         return u, slack
 
     def _lacking(self, given: tuple[Tensor, ...]) -> Tensor:
-        """What u would have to reach further to win so much of h within the hold, more than `INFEASIBLE`."""
+        """Return what u lacks to win so much of h within the hold, more than `INFEASIBLE`."""
         x, t, short = given
         lean = Lean(*self.conditions.every(self.conditions.lean, x, t))
         second = torch.tensor(self.degree, dtype=torch.int64, device=x.device) == 2

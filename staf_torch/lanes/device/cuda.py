@@ -37,7 +37,7 @@ _lock = Mutex()
 
 
 class CudaDevice:
-    """One device of CUDA.
+    """A CUDA device.
 
     Args:
         index: as torch counts them.

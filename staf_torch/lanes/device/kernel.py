@@ -23,7 +23,7 @@ _MOST = 2**31 - 1  # of an offset of 32 bits
 
 
 class Device(Protocol):
-    """What runs kernels."""
+    """Interface of a device that runs kernels."""
 
     def compile(self, text: str) -> Any:
         """Return the kernel of a text; raises OSError where it cannot."""

@@ -60,7 +60,7 @@ _PHILOX = """%(how)s %(real)s %(name)s(%(given)s)
 
 
 class ScalarWriter(MatrixWriter):
-    """What C and CUDA C have in common: every number is a variable of its own."""
+    """Writer of scalar code, common to C and CUDA C: every number is a variable of its own."""
 
     _infix: ClassVar[dict[str, str]] = MatrixWriter._infix | {"and": "&&", "or": "||", "xor": "!="}
     _prefix: ClassVar[dict[str, str]] = MatrixWriter._prefix | {"not": "!"}

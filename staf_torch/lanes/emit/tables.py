@@ -1,4 +1,4 @@
-"""What C++ and CUDA have in common: a table of captured numbers, and slots of the carry that are arrays."""
+"""Tables common to C++ and CUDA: captured numbers, and slots of the carry that are arrays."""
 
 from __future__ import annotations
 

@@ -146,7 +146,7 @@ def _turn(matrix: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
 
 
 def _in_memory(gram: Tensor) -> tuple[list[Tensor], list[Tensor], Tensor]:
-    """As `_tridiagonal`, of a matrix over its largest entry, and that: a program has an operation for it.
+    """Return `_tridiagonal` of a matrix over its largest entry, and the entry: an operation of programs.
 
     It stays below the diagonal of one triangle in memory, of which the text of a loop reads and writes a
     quarter of what passes over whole matrices do.

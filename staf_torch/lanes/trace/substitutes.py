@@ -1,4 +1,4 @@
-"""What to write in place of an operation that has no scalar form: for the log line that names it."""
+"""Substitutes for operations without a scalar form, for the log line that names one."""
 
 from __future__ import annotations
 

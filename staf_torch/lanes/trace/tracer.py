@@ -205,7 +205,7 @@ class Tracer(TorchDispatchMode):
         return self.entries(array, kind, outs).reshape(shape[:-1])
 
     def tridiagonal(self, flat: Ids, size: int, kind: str) -> Ids:
-        """Of a symmetric matrix over its largest |entry|: the diagonal, the squares beside it; that entry."""
+        """Return diagonal and squares beside it of a symmetric matrix over its largest |entry|, and that."""
         array, places = self.array(flat, kind)
         aux = ("copy", (size, size), tuple(places.tolist()))
         return self.entries(self.graph.add("tridiagonal", (array,), kind, aux), kind, 2 * size)

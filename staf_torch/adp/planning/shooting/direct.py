@@ -349,11 +349,11 @@ class DirectShooting:
         return here & self.stays
 
     def _graded(self) -> bool:
-        """Whether intervals grow along a mesh: without bounds, or where one start finds the optimum."""
+        """Return whether intervals grow along a mesh: without bounds, or if one start finds the optimum."""
         return self.stage.cost.bounds is None or self._convex()
 
     def _convex(self) -> bool:
-        """Whether every stationary plan is the optimum: a linear plant, and a cost without an output."""
+        """Return whether every stationary plan is the optimum: a linear plant, a cost without an output."""
         system, cost = self.stage.system, self.stage.cost
         plain = type(cost) in (QuadraticCost, BoundedInputCost) and cost.output is None
         return isinstance(system, Linear) and not system.periodic and plain and self.quadratic_end

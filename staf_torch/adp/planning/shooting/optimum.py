@@ -49,7 +49,7 @@ class Optimum(NamedTuple):
         )
 
     def to(self, device: torch.device) -> Optimum:
-        """The same on a device."""
+        """Return the optimum on a device."""
         moved: dict[str, Any] = {
             name: part.to(device) for name, part in self._asdict().items() if name != "reason"
         }

@@ -1,0 +1,60 @@
+"""Plain words: how docstrings and manuals begin and how long their sentences are, and a spell checker."""
+
+from __future__ import annotations
+
+import ast
+import re
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from command_line import ROOT
+
+RIDDLE = re.compile(r"(What|Whether|Of|As|One|Where|How|The same)\b")
+MANUALS = [
+    ROOT / "README.md",
+    ROOT / "CHANGELOG.md",
+    ROOT / "runs" / "README.md",
+    ROOT / "conf" / "README.md",
+]
+MANUALS += sorted((ROOT / "staf_torch").rglob("*.md"))
+SHAPES = re.compile(r"^```.*?^```$|^ {4}.*?$|^\|.*?$|^#.*?$|^!\[.*?$", re.DOTALL | re.MULTILINE)
+
+
+def docstrings(path: Path) -> Iterator[str]:
+    """First lines of all docstrings of a file."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+            text = ast.get_docstring(node)
+            if text:
+                yield text.partition("\n")[0]
+
+
+def test_docstrings_begin_with_a_subject_and_an_action() -> None:
+    lines = [line for path in (ROOT / "staf_torch").rglob("*.py") for line in docstrings(path)]
+    riddles = [line for line in lines if RIDDLE.match(line)]
+    assert len(riddles) <= 0.02 * len(lines), riddles
+
+
+def sentences(path: Path) -> Iterator[str]:
+    text = SHAPES.sub("\n\n", path.read_text(encoding="utf-8"))
+    for paragraph in re.split(r"\n\s*\n|\n[*-] ", re.sub(r"\]\([^)]*\)", "]", text)):
+        yield from re.split(r"(?<=[.!?])\s+(?=[A-Z`*\[(\"])", paragraph)
+
+
+@pytest.mark.parametrize("path", MANUALS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_a_manual_is_a_page_of_sentences_that_can_be_read_aloud(path: Path) -> None:
+    limit = {"README.md": 150, "CHANGELOG.md": 60}.get(str(path.relative_to(ROOT)), 120)
+    assert len(path.read_text(encoding="utf-8").splitlines()) <= limit
+    long = [" ".join(each.split()) for each in sentences(path) if len(re.findall(r"\S*\w\S*", each)) > 40]
+    assert long == []
+
+
+def test_words_are_spelled_as_a_dictionary_has_them() -> None:
+    checker = shutil.which("codespell")
+    if checker is None:
+        pytest.skip("codespell is not installed")
+    ended = subprocess.run([checker], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stdout
