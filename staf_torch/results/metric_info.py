@@ -48,6 +48,35 @@ OWN = (
     MetricInfo("diverged_fraction", unit="1"),
 )
 """The library's own metrics, headlines in the order in which a table shows them."""
+MEANINGS = {
+    "ultimate_error": "largest |V - V^| at the state, after settling",
+    "ultimate_error_before": "the same before the correction",
+    "floor_error": "the same with the ideal weights",
+    "ultimate_excess": "largest (a - w)'K(a - w) of the weights a, after settling",
+    "ultimate_excess_before": "the same before the correction",
+    "ball_error": "largest |V - V^| over the closed ball of the centers' radius, after settling",
+    "ball_floor_error": "the same with the ideal weights: the best that kernel, radius and layout allow",
+    "rounding_floor": "machine epsilon times the largest |V|: no error below it means anything",
+    "gradient_error": "largest |grad V - grad V^| at the state, centers frozen",
+    "condition_number": "largest condition number of the Gram matrix",
+    "settling_time": "from here on the excess stays below ultimate_excess",
+    "contraction_violations": "steps whose excess shrank by less than the law's rate promises",
+    "certificate_violations": "steps that break the one-step bound",
+    "products_per_second": "products of an M x M matrix with a vector, a second of the trajectory",
+    "cost": "median cost of the closed loop",
+    "optimal_cost": "median least cost from the same states",
+    "cost_ratio": "cost over the least cost, median",
+    "cost_ratio_mean": "cost over the least cost, mean",
+    "cost_ratio_max": "cost over the least cost, largest",
+    "final_state_norm": "largest |x| at the end",
+    "final_error": "largest |x - path| at the end",
+    "parameter_error": "largest error of an identified parameter at the end",
+    "control_error": "largest |u - u*| over the second half of the time",
+    "value_error": "largest |V* - V^| over the second half of the time",
+    "regulated_fraction": "share of trajectories with |x| < 1e-3 at the end; larger is better",
+    "diverged_fraction": "share of trajectories that became non-finite",
+}
+"""What a reader of a table needs to know of each of the library's own metrics."""
 HEADLINES = tuple(info.name for info in OWN if info.headline)
 
 

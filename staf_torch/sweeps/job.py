@@ -21,7 +21,7 @@ from ..experiments.registry import Metrics
 from ..lanes.compiler import compiler
 from ..numerics.checks import COMMAND_LINE, choice
 from ..results import run_record as records
-from ..results.files import METRICS
+from ..results.files import FIGURES, METRICS
 from ..results.progress import SHOWN, Progress
 from ..settings.chase import make_metrics, units_of
 from ..signs import Sign
@@ -78,6 +78,8 @@ def execute(
                 record.measured_in(units_of(cfg))
                 metrics = completion(cfg, outcome)(cfg, directory, progress)
             _log.info("  run directory: %s", os.path.relpath(directory))
+            if pictures := sorted(path.name for path in (directory / FIGURES).glob("*.png")):
+                _log.info("  pictures: %s (%s)", os.path.relpath(directory / FIGURES), ", ".join(pictures))
     except BaseException as error:
         refused = isinstance(error, USER_ERRORS)
         if node.mode != RunMode.RUN:  # a job of a sweep keeps its log, and the sweep goes on

@@ -18,6 +18,7 @@ import numpy as np
 from ..figures.style import images
 from ..figures.sweep import SEED, SWEEP_FIGURES
 from ..results.files import COMPLETED, PAGE, ROWS, SWEEP, TABLE, parse_overrides
+from ..results.metric_info import MEANINGS
 from ..results.reader import Collection, Value, collect, identity, read_record, read_rows
 from ..results.run import as_text
 from ..results.run_directory import RunDirectory
@@ -153,7 +154,7 @@ def page(
     about: str | None = None,
     facts: Mapping[str, str] | None = None,
 ) -> str:
-    """Return `report.html`: one file without links with the table, the figures and the settings.
+    """Return `report.html`: one file with the table, the figures and the settings, linked to the runs.
 
     Args:
         found: the runs.
@@ -170,6 +171,7 @@ def page(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     columns = dataclasses.replace(table, style=_ON_THE_PAGE).printed()
+    named = dict.fromkeys(column.name for column in columns if column.metric)
     skipped = [f"skipped {one.path}: {one.reason}" for one in found.skipped]
     return environment.from_string(source.read_text(encoding="utf-8")).render(
         title=title,
@@ -179,6 +181,8 @@ def page(
         headings=[_heading(column, found) for column in columns],
         rows=[[_cell(column, row) for column in columns] for row in range(len(table.rows))],
         figures={what: base64.b64encode(png).decode() for what, png in figures.items()},
+        meanings={name: MEANINGS[name] for name in named if name in MEANINGS},
+        runs=[run.directory.as_posix() for run in found.rows if run.directory.parts],
         settings={key: as_text(value) for key, value in _common(found).items()},
     )
 

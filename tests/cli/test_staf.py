@@ -300,12 +300,16 @@ def test_the_ablation_ends_with_the_errors_of_the_layouts(outcomes: dict[str, Ou
     assert "<table" in (sweep / "report.html").read_text()
 
 
-def test_help_lists_the_groups_and_the_settings(outcomes: dict[str, Outcome]) -> None:
+def test_help_is_one_screen_of_commands_groups_and_settings(outcomes: dict[str, Outcome]) -> None:
     outcome = outcomes["help"]
     assert outcome.code == 0
     assert outcome.left == set()
-    for words in ("State Following", "kernel:", "exponential", "initial_state", "duration"):
+    for words in ("State Following", "kernel:", "exponential", "initial_state", "duration", "staf-table"):
         assert words in outcome.out
+    assert all(word in outcome.out for word in ("doctor", "schema", "docs", "staf-export", "--cfg job"))
+    lines = outcome.out.splitlines()
+    assert len(lines) <= 42
+    assert max(map(len, lines)) <= 110
 
 
 # What a user gets wrong
