@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from ..approximation.basis import GramStructure
+from ..lanes import each
 from ..local_basis import LocalSpace
 from ..optim.objective import Precomputed, extremes
 from .certificate import Certificate
@@ -92,7 +93,9 @@ def _inverse(space: LocalSpace, gram: Tensor) -> Tensor:
     """Return (e^{-g} K)^-1, (..., M, M): each column a fit to a unit vector of values."""
     units = torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
     units = units.view(-1, *[1] * (gram.dim() - 2), gram.shape[-1]).expand(-1, *gram.shape[:-1])
-    return space.scaled_weights(space.fit(units)).movedim(0, -1)
+    # One after the other in a program, which else holds several matrices of a row.
+    columns = each(lambda some: space.scaled_weights(space.fit(some)), units, dim=0, together=1)
+    return columns.movedim(0, -1)
 
 
 class Numbers(NamedTuple):
