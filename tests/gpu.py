@@ -329,6 +329,27 @@ def in_a_graph() -> bool:
     return away == 0.0
 
 
+def simulated_in_a_graph() -> bool:
+    """Whether `systems.simulate` is recorded, too, and marks the rows that need shorter steps."""
+    from staf_torch import systems
+
+    plant, away = systems.VanDerPol().to(DEVICE), 0.0
+    x = torch.linspace(-1, 1, 2000, dtype=torch.float64, device=DEVICE).reshape(1000, 2)
+    for _ in range(4):
+        systems.simulate(plant, x, dt=0.01, steps=100)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        found = systems.simulate(plant, x, dt=0.01, steps=100)
+    for scale in (0.5, 100.0):
+        x.mul_(scale)
+        graph.replay()
+        wait()
+        good = found.isfinite().flatten(1).all(1)
+        wanted = systems.simulate(plant, x, dt=0.01, steps=100)
+        away = max(away, error(found[good], wanted[good]))
+    return away == 0.0 and not bool(good.all())
+
+
 def on_streams() -> bool:
     """Whether calls on streams of their own, one after the other, have the numbers of one."""
     _, call = on_device("M = 3 SteepestDescent, 100", torch.float64, 1000)
@@ -408,7 +429,7 @@ def same_there(call: Callable[[str], Any]) -> bool:
     return away < 1e-9
 
 
-def registers(only: str) -> int:
+def registers(only: str, architectures: tuple[int, ...]) -> int:
     """Compile the kernels with nvcc for several architectures; print their registers and what is spilled."""
     bad = 0
     for name, (make, _) in KINDS.items():
@@ -420,7 +441,7 @@ def registers(only: str) -> int:
             with lanes.compiling("always"), lanes.device.recorded() as texts:
                 case.call(*case.inputs)
             for text in texts:
-                found = ptxas(text)
+                found = ptxas(text, architectures)
                 spilled = sum(each[1] for each in found.values())
                 bad |= int(spilled > 0)
                 told = ", ".join(
@@ -434,6 +455,7 @@ def main() -> int:
     global DEVICE
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     options.add_argument("--ptxas", action="store_true")
+    options.add_argument("--architectures", default="80,90,100", help="of --ptxas")
     options.add_argument("--host", action="store_true", help="the host as a device, few rows")
     options.add_argument("--only", default="")
     options.add_argument("--largest", type=int, default=10**9, help="rows")
@@ -441,7 +463,7 @@ def main() -> int:
     options.add_argument("--seconds", type=float, default=170.0, help="after which nothing more is begun")
     given = options.parse_args()
     if given.ptxas:
-        return registers(given.only)
+        return registers(given.only, tuple(map(int, given.architectures.split(","))))
     if given.host:
         DEVICE = "cpu"
         with lanes.device.host():
@@ -518,7 +540,7 @@ def table(names: Sequence[str], largest: int, until: float = float("inf")) -> It
             torch.cuda.empty_cache()
 
 
-CHECKS = in_a_graph, on_streams, in_threads, nothing_waits
+CHECKS = in_a_graph, simulated_in_a_graph, on_streams, in_threads, nothing_waits
 
 
 def checked(checks: tuple[Callable[[], bool], ...] = CHECKS) -> Iterator[bool]:

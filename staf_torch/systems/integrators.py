@@ -41,7 +41,7 @@ def trajectory(
     The exact flow where the system has one, else Runge-Kutta steps of length dt; a trajectory whose rate is
     too fast for that takes as many a dt as leave an error of 1e-6 of its state, and where they are too many
     the log has a warning. A trajectory that escapes to infinity is non-finite from there on; the others do
-    not notice.
+    not notice. Within `torch.cuda.graph` nobody can take smaller steps: a row that needs them is NaN.
 
     Example:
         >>> x0 = torch.tensor([[1.0, 0.0]]).double()
@@ -81,6 +81,11 @@ def trajectory(
                 yield exact
                 continue
         (after, bent, reach), piece = program((x, none, none), steps=stop - start)
+        if x.is_cuda and torch.cuda.is_current_stream_capturing():  # nothing can be read, nor done again
+            strained = ~(bent <= BENT * reach) & torch.isfinite(reach)
+            x = torch.where(strained.unsqueeze(-1), torch.nan, after)
+            yield torch.where(strained[:, None, None], torch.nan, piece)
+            continue
         if _calm(bent, reach):
             x = after
             yield piece

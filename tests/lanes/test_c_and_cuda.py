@@ -217,6 +217,17 @@ def test_a_kernel_on_the_host_is_the_definition(dtype: torch.dtype, bound: float
             torch.testing.assert_close(one, other, rtol=bound, atol=bound)
 
 
+def test_results_lie_rows_innermost_and_those_without_room_are_refused() -> None:
+    program, x = lanes.Program(lambda x, now, row: (0.5 * x, x.square())), torch.ones(5, 9000)
+    with lanes.device.recorded() as texts:
+        assert program(x, steps=4)[1].stride() == (1, 45000, 5)
+        with pytest.raises(RuntimeError, match=r"3.87e\+05 GB on cpu, for 5 rows and 2147483647"):
+            program(x, steps=2**31 - 1)
+    few, many = (text.partition("#ifndef OFFSET")[0] for text in texts)
+    assert "#define OFFSET" not in few
+    assert "#define OFFSET long long" in many
+
+
 def test_a_chase_that_is_made_again_is_one_kernel() -> None:
     """Nothing is computed around it and nothing is read from the device; what has changed is noticed."""
     basis = StaFBasis(kernels.ExponentialKernel(), centers.StateFollowingCenters(DIRECTIONS, 0.3))

@@ -14,6 +14,7 @@ import importlib
 import itertools
 import logging
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -22,12 +23,13 @@ import torch
 
 from ...signs import Sign
 from ..cache import cache, found, publish, scratch, used
-from ..emit.cuda import KERNEL
+from ..emit.cuda import FEWER_REGISTERS, KERNEL
 from ..locks import Mutex
 
 _log = logging.getLogger(__name__)
 REMEDY = "install torch with CUDA, or `pip install staf-torch[cuda]`"
-_OPTIONS = ("--std=c++17", "--fmad=false")
+_OPTIONS = ("--std=c++17", "--fmad=false", "--ptxas-options=-v")
+_SPILLED = re.compile(r"(\d+) bytes spill stores")
 _DIGEST = 32
 _WARP, _BLOCK = 32, 128
 _FEW = 8  # warps a multiprocessor up to which every warp is a block, so that all multiprocessors have some
@@ -201,13 +203,23 @@ class Nvrtc:
     def compile(self, text: str, architecture: int) -> bytes:
         """Return machine code, or PTX of the latest that it knows where a card is newer.
 
+        What does not fit into registers is compiled once more for fewer, and the better one is taken.
+
         Raises:
             OSError: with what it says.
         """
+        code, spilled = self._compiled(text, architecture, ())
+        if spilled:
+            other, less = self._compiled(text, architecture, (FEWER_REGISTERS,))
+            code = other if less < spilled else code
+        return code
+
+    def _compiled(self, text: str, architecture: int, more: tuple[str, ...]) -> tuple[bytes, int]:
+        """Machine code, and the bytes of registers that it stores elsewhere."""
         known = self.architectures()
         latest = max((each for each in known if each <= architecture), default=architecture)
         kind = "sm" if architecture in known else "compute"
-        options = [*_OPTIONS, f"--gpu-architecture={kind}_{architecture if kind == 'sm' else latest}"]
+        options = [*_OPTIONS, *more, f"--gpu-architecture={kind}_{architecture if kind == 'sm' else latest}"]
         words = (ctypes.c_char_p * len(options))(*(each.encode() for each in options))
         program, library = ctypes.c_void_p(), self._library
         library.nvrtcCreateProgram(ctypes.byref(program), text.encode(), b"lanes.cu", 0, None, None)
@@ -215,9 +227,10 @@ class Nvrtc:
             if library.nvrtcCompileProgram(program, len(options), words):
                 raise OSError(f"NVRTC {self.version}: {self._read('ProgramLog', program).decode()[:600]}")
             code = self._read("CUBIN" if kind == "sm" else "PTX", program)
+            told = self._read("ProgramLog", program).decode(errors="replace")
         finally:
             library.nvrtcDestroyProgram(ctypes.byref(program))
-        return code
+        return code, sum(map(int, _SPILLED.findall(told)))
 
     def _read(self, what: str, program: ctypes.c_void_p) -> bytes:
         size = ctypes.c_size_t()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import math
 import struct
 from collections.abc import Collection, Sequence
 from typing import Any, Protocol
@@ -142,20 +143,37 @@ class DeviceCall:
 
         Args:
             leaves: inputs of the forms that the examples had.
+
+        Raises:
+            RuntimeError: of the kind that torch raises, if there is no memory for them.
         """
         given = [leaf.tensor if type(leaf) is Shared else leaf for leaf in self._with_columns(leaves)]
         for k in self._copied:
             given[k] = given[k].to(self._where).contiguous()
         where, empty = self._where, torch.empty_strided
-        rooms: list[Any] = [
-            None if room is None else empty(room[0], room[1], dtype=room[2], device=where)
-            for room in self._rooms
-        ]
+        try:
+            rooms: list[Any] = [
+                None if room is None else empty(room[0], room[1], dtype=room[2], device=where)
+                for room in self._rooms
+            ]
+        except RuntimeError as error:
+            raise type(error)(self._too_large()) from error
         addresses = [0 if room is None else room.data_ptr() for room in rooms]
         with self._lock:  # the driver copies the structure when it is called
             self._pack(self._record, 0, *map(_address, given), *addresses)
             self._device.launch(self._kernel, self._reference, self._rows)
         return rooms
+
+    def _too_large(self) -> str:
+        """What to do where results find no room."""
+        some = [room for room in self._rooms if room is not None]
+        size = sum(math.prod(shape) * dtype.itemsize for shape, _, dtype in some)
+        times = max((shape[1] for shape, *_ in self._rooms[len(self._compiled.carry) :] if shape), default=0)
+        return (
+            f"The results of this call take {size / 1e9:.3g} GB on {self._where}, for {self._rows} rows and "
+            f"{times} recorded times; there is no room for them. Record fewer times (`every=`), leave the "
+            "history out (`history=False`) where that is offered, or call for fewer rows or times in turn."
+        )
 
     def leave_out(self, ends: Collection[int]) -> None:
         """Write nothing of these of the carry: None is in their place from now on."""

@@ -39,11 +39,18 @@ _LOOP = re.compile(r"for \(int ([pq]\w*) = \d+; [pq]\w* < (\d+);")
 _UNROLLED = 16  # passes over an array that a compiler may write out
 _WHOLE = 36  # entries that it is to write out, so that they may be in registers
 _KNOWN = 256  # numbers of an array that it knows, where a pass that is written out has one of them
+FEWER_REGISTERS = "-DFEWER_REGISTERS"
+"""An option for a compiler that has too few registers: sums of products are not written out all at once."""
 _PRELUDE = """#ifndef NAN
 #define NAN __int_as_float(0x7fffffff)
 #endif
 #ifndef INFINITY
 #define INFINITY __int_as_float(0x7f800000)
+#endif
+#ifdef FEWER_REGISTERS
+constexpr int PANELS = 1;
+#else
+constexpr int PANELS = 16;
 #endif
 #ifndef OFFSET
 #define OFFSET int
@@ -126,7 +133,7 @@ class _CudaWriter(ScalarWriter, TableWriter):
         """A line; a loop over few entries is written out by the compiler, one over many is not."""
         loop = _LOOP.match(text)
         if loop and loop[1] in ("p", "q") and int(loop[2]) <= _WHOLE:
-            super()._line("#pragma unroll")
+            super()._line("#pragma unroll PANELS" if "p +=" in text else "#pragma unroll")
         elif loop and int(loop[2]) > _UNROLLED:
             super()._line("#pragma unroll 4")
         elif loop is None and text.startswith("for (int u"):  # over as much of a matrix as is left
