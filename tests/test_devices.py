@@ -67,6 +67,8 @@ def test_a_plant_and_its_trajectories_follow_the_states(name: str) -> None:
     x0 = 0.1 * torch.ones(2, plant.dim, dtype=torch.float64)
     wanted = systems.simulate(plant, x0, dt=0.01, steps=2)
     moved = PLANTS[name]().to(DEVICE)
+    made_here = systems.simulate(plant, there(x0), dt=0.01, steps=2)
+    agree(made_here, wanted)
     agree(systems.simulate(moved, there(x0), dt=0.01, steps=2), wanted)
     agree(moved.linearisation().matrix, plant.linearisation().matrix)
 

@@ -91,4 +91,5 @@ def stage_weights(length: float | Tensor, discount: float, like: Tensor) -> tupl
     asked = torch.stack((torch.zeros_like(length), 0.5 * length, 0.5 * length, length))
     counted = torch.stack((ends, middle, middle, ends))
     worth = torch.stack((ends, middle * half, middle * half, ends * half.square()))
-    return asked.unsqueeze(-1), counted.unsqueeze(-1), worth
+    # A number of the table is on the CPU in float64.
+    return asked.to(like).unsqueeze(-1), counted.to(like).unsqueeze(-1), worth.to(like)

@@ -116,8 +116,8 @@ class Barrier(ControlAffineSystem):
         """`transform` without its check, NaN outside the box, for compiled loops: (..., n) -> (..., n)."""
         center = self.center.to(x)
         x = center + wrap(x - center, self._turning) if self._turning else x
-        down = torch.where(self.walled[0], (x - self.floor.to(x)) * self.below.to(x), 1.0)
-        up = torch.where(self.walled[1], (self.ceiling.to(x) - x) * self.above.to(x), 1.0)
+        down = torch.where(self.walled[0].to(x.device), (x - self.floor.to(x)) * self.below.to(x), 1.0)
+        up = torch.where(self.walled[1].to(x.device), (self.ceiling.to(x) - x) * self.above.to(x), 1.0)
         return self._coordinate(x - center, down, up)
 
     def inverse(self, s: Tensor) -> Tensor:
@@ -126,14 +126,16 @@ class Barrier(ControlAffineSystem):
         # From the wall where that is near, from the middle where s is small: no digit is lost in either.
         from_low = self.floor.to(s) + down * (self.center - self.floor).to(s)
         from_high = self.ceiling.to(s) - up * (self.ceiling - self.center).to(s)
-        x = torch.where((up < 0.5) & self.walled[1], from_high, self.center.to(s) + apart)
-        return torch.where((down < 0.5) & self.walled[0], from_low, x)
+        x = torch.where((up < 0.5) & self.walled[1].to(s.device), from_high, self.center.to(s) + apart)
+        return torch.where((down < 0.5) & self.walled[0].to(s.device), from_low, x)
 
     def walls(self, s: Tensor) -> tuple[Tensor, Tensor]:
         """x - low and high - x with all digits, inf where there is no wall: (..., n) -> two (..., n)."""
         _, down, up = self._shares(s)
         to_low, to_high = down * (self.center - self.floor).to(s), up * (self.ceiling - self.center).to(s)
-        return torch.where(self.walled[0], to_low, torch.inf), torch.where(self.walled[1], to_high, torch.inf)
+        return torch.where(self.walled[0].to(s.device), to_low, torch.inf), torch.where(
+            self.walled[1].to(s.device), to_high, torch.inf
+        )
 
     def margin(self, s: Tensor) -> Tensor:
         """The distance to the nearest wall, in the units of its coordinate: (..., n) -> (...)."""
@@ -145,7 +147,7 @@ class Barrier(ControlAffineSystem):
         left = s < 0
         small = torch.where(left, s, -s).exp()
         whole = torch.where(left, below + above * small, above + below * small)
-        return torch.where(self.free, 1.0, whole.square() / ((below + above) * small))
+        return torch.where(self.free.to(s.device), 1.0, whole.square() / ((below + above) * small))
 
     def drift(self, s: Tensor) -> Tensor:
         return self.stretch(states(self, "s", s, self.dim)) * self.plant.drift(self.inverse(s))
@@ -163,8 +165,8 @@ class Barrier(ControlAffineSystem):
     def displaced(self, s: Tensor, step: Tensor) -> Tensor:
         """s of the state whose x is ``step`` further on, NaN beyond a wall: (..., n) twice -> (..., n)."""
         apart, down, up = self._shares(s)
-        down = torch.where(self.walled[0], down + step * self.below.to(s), 1.0)
-        up = torch.where(self.walled[1], up - step * self.above.to(s), 1.0)
+        down = torch.where(self.walled[0].to(s.device), down + step * self.below.to(s), 1.0)
+        up = torch.where(self.walled[1].to(s.device), up - step * self.above.to(s), 1.0)
         return self._coordinate(apart + step, down, up)
 
     def step_limit(self, s: Tensor, u: Tensor) -> Tensor:
@@ -194,7 +196,7 @@ class Barrier(ControlAffineSystem):
         near = far * share
         apart = torch.where(left, small.expm1(), -small.expm1()) / whole
         down, up = torch.where(left, near, far), torch.where(left, far, near)
-        return torch.where(self.free, s, apart), down, up
+        return torch.where(self.free.to(s.device), s, apart), down, up
 
     def _coordinate(self, apart: Tensor, down: Tensor, up: Tensor) -> Tensor:
         """s by log1p of what the nearer wall's share is short of the other, which loses no digit."""
@@ -203,7 +205,9 @@ class Barrier(ControlAffineSystem):
         s = (torch.where(left, -apart, apart) * whole / torch.where(left, down, up)).log1p()
         s = torch.where(left, -s, s)
         # The far wall has no part in s, but a step may lead through it.
-        return torch.where(self.free, apart, torch.where((down > 0) & (up > 0), s, torch.nan))
+        return torch.where(
+            self.free.to(apart.device), apart, torch.where((down > 0) & (up > 0), s, torch.nan)
+        )
 
 
 def wall_numbers(call: str, name: str, given: Wall, none: float, size: int) -> Tensor:
