@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from command_line import ROOT, environment, in_a_child, one
@@ -23,27 +23,27 @@ from staf_torch.cli import export, table
 GUIDES = ROOT / "staf_torch" / "guides"
 PICTURES = GUIDES / "pictures"
 GALLERY = GUIDES / "GALLERY.md"
+KINDS = ("python", "bash")
 WIDTH, LARGEST = 1200, 60_000  # pixels of a picture, and bytes
 _BLOCK = re.compile(r"^```(python|bash)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
-_ENTRY = re.compile(r"```bash\n([^`]*)```\n+!\[[^]]*\]\(pictures/(\w+)\.webp\)\n+`([^`]+\.(?:png|gif))`")
+_PICTURE = re.compile(r"^!\[[^]]*\]\(pictures/(\w+)\.webp\)$(?:\n\n`([^`]+)`$)?", re.MULTILINE)
 
 
-def blocks(path: Path, kinds: tuple[str, ...] = ("python", "bash")) -> Iterator[tuple[int, str, str]]:
+def blocks(text: str, kinds: Sequence[str] = KINDS) -> Iterator[tuple[int, str, str]]:
     """Line, kind and text of the blocks of a page that are run."""
-    text = path.read_text(encoding="utf-8")
     for found in _BLOCK.finditer(text):
         if found[1] in kinds:
             yield text[: found.start(2)].count("\n"), found[1], found[2]
 
 
-def run_page(path: Path, kinds: tuple[str, ...] = ("python", "bash")) -> None:
+def run_page(text: str, name: str, kinds: Sequence[str] = KINDS) -> None:
     """Run the blocks of a page in the working directory, with names that the Python of the page shares."""
     names: dict[str, object] = {"__name__": "__main__"}
-    for line, kind, text in blocks(path, kinds):
+    for line, kind, block in blocks(text, kinds):
         if kind == "python":
-            exec(compile("\n" * line + text, str(path.relative_to(ROOT)), "exec"), names)
+            exec(compile("\n" * line + block, name, "exec"), names)
         else:
-            run_commands(text)
+            run_commands(block)
 
 
 def run_commands(text: str) -> None:
@@ -68,8 +68,12 @@ def _program(program: str, arguments: list[str]) -> tuple[int, str, str]:
 
 
 def entries() -> dict[str, tuple[str, str]]:
-    """Command and file of every picture of the gallery."""
-    return {found[2]: (found[1], found[3]) for found in _ENTRY.finditer(GALLERY.read_text(encoding="utf-8"))}
+    """Text and file of every picture of the gallery."""
+    found = {}
+    for text in re.split(r"^#+ ", GALLERY.read_text(encoding="utf-8"), flags=re.MULTILINE):
+        for picture in _PICTURE.finditer(text):
+            found[picture[1]] = text, picture[2] or f"{picture[1]}.png"
+    return found
 
 
 def guides() -> list[Path]:
@@ -95,19 +99,16 @@ def keep(drawn: Path, name: str) -> None:
 
 def main(chosen: list[str]) -> None:
     PICTURES.mkdir(exist_ok=True)
-    made = {path.stem: path for path in guides()}
-    shown = entries() if GALLERY.exists() else {}
-    for name in chosen or [*made, *shown]:
+    pages = {
+        path.stem: (path.read_text(encoding="utf-8"), f"{path.stem}.png") for path in guides()
+    } | entries()
+    for name in chosen or pages:
         before, children = time.process_time(), os.times()
+        text, drawn = pages[name]
         with tempfile.TemporaryDirectory() as folder:
             os.chdir(folder)
-            if name in made:
-                run_page(made[name])
-                drawn = Path(folder) / f"{name}.png"
-            else:
-                run_commands(shown[name][0])
-                drawn = Path(folder) / shown[name][1]
-            keep(drawn, name)
+            run_page(text, name)
+            keep(Path(folder) / drawn, name)
             os.chdir(ROOT)
         after = os.times()
         spent = time.process_time() - before + sum(after[2:4]) - sum(children[2:4])

@@ -66,7 +66,9 @@ def asked(path: Path) -> object:
     return pytest.param(path, marks=marks, id=name(path))
 
 
-@pytest.mark.parametrize("path", [asked(p) for p in [README, *MANUALS] if any(guides.blocks(p, ("python",)))])
+@pytest.mark.parametrize(
+    "path", [asked(p) for p in [README, *MANUALS] if any(guides.blocks(read(p), ("python",)))]
+)
 def test_blocks_of_a_page_run_one_after_another(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -74,10 +76,10 @@ def test_blocks_of_a_page_run_one_after_another(
     if path.parent.name == "deploy" and not compiler.compiler():
         pytest.skip("its C is compiled")
     if path not in guides.guides():
-        return guides.run_page(path, ("python",))
+        return guides.run_page(read(path), name(path), ("python",))
     if path.stem == "plant_to_c" and not shutil.which("gcc"):
         pytest.skip("its C is compiled")
-    guides.run_page(path)
+    guides.run_page(read(path), name(path))
     assert (tmp_path / f"{path.stem}.png").exists(), "a guide ends with a picture that its reader gets"
     assert f"](pictures/{path.stem}.webp)" in read(path)
     assert "runs in plain torch" not in caplog.text
