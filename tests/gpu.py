@@ -494,7 +494,7 @@ def on_card(given: argparse.Namespace) -> int:
     spawn = multiprocessing.get_context("spawn")
     rival: dict[Any, Any] = {}
     with (
-        concurrent.futures.ThreadPoolExecutor(4) as threads,
+        concurrent.futures.ThreadPoolExecutor(8) as threads,
         concurrent.futures.ProcessPoolExecutor(workers, mp_context=spawn) as pool,
     ):
         tried = [] if given.only else [threads.submit(experiment, name) for name in EXPERIMENTS]
@@ -517,7 +517,9 @@ def on_card(given: argparse.Namespace) -> int:
     RIGHT.extend(checked())
     peers.compared(rival, RATES, until)
     if not given.no_peers:
-        laws = [name for name in names if name.startswith("M =")]
+        laws = sorted(
+            (name for name in names if name.startswith("M =")), key=lambda name: "M = 15" not in name
+        )
         peers.eager(laws, lambda *what: made(*what), RATES, DEVICE, until)
     print(f"{time.perf_counter() - begin:.0f} s in all; {'all right' if all(RIGHT) else 'WRONG'}")
     return int(not all(RIGHT))
