@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -35,7 +36,8 @@ def square(x: Tensor) -> Tensor:
 
 def whole(x: Any) -> Any:
     """States as those of one time, (B, 1, n)."""
-    return x.unsqueeze(1) if isinstance(x, Tensor) and x.dim() == 2 and x.layout is torch.strided else x
+    plain = isinstance(x, Tensor) and x.layout is torch.strided and not x.is_nested and x.dim() == 2
+    return x.unsqueeze(1) if plain else x
 
 
 DOORS: dict[str, Callable[[Any], Any]] = {
@@ -59,6 +61,9 @@ DOORS: dict[str, Callable[[Any], Any]] = {
     "Pendulum": lambda x: PLANT.rate(x, X[:, :1]),
     "hjb_residual": lambda x: adp.hjb_residual(PLANT, COST, square, x),
 }
+with warnings.catch_warnings():  # torch calls both of them prototypes
+    warnings.simplefilter("ignore")
+    COMPRESSED, NESTED = X.to_sparse_csr(), torch.nested.nested_tensor([*X])
 REFUSED: dict[str, tuple[Any, str]] = {
     "integers": ((4 * X).long(), r"floating-point tensor and is torch.int64: write `.double\(\)`; got"),
     "flags": (X > 0, r"is torch.bool: write `.double\(\)`"),
@@ -68,6 +73,8 @@ REFUSED: dict[str, tuple[Any, str]] = {
     "nothing": (None, "must be a tensor, .*got None"),
     "one number": (torch.tensor(0.5, dtype=torch.float64), r"must have at least \d dimensions?; got the"),
     "sparse": (X.to_sparse(), r"must be dense; got torch.sparse_coo: write `.to_dense\(\)`"),
+    "sparse rows": (COMPRESSED, r"must be dense; got torch.sparse_csr: write `.to_dense\(\)`"),
+    "nested": (NESTED, "must be one dense tensor; got a nested one"),
     "other states": (torch.zeros(3, 5, dtype=torch.float64), "must have 2 entries in its last dimension"),
 }
 
@@ -317,8 +324,10 @@ def test_a_regressor_reads_no_address_of_a_tensor_without_numbers() -> None:
         fitted = kind().fit(SIX[:, 0].numpy(), SIX[:, 0, 0].numpy())
         right = fitted.predict(X[0])
         assert fitted.predict(torch.complex(0 * X[0], -X[0]).conj().imag).equal(right)
+        assert fitted.predict(torch._neg_view(-X[:1])).equal(right.unsqueeze(0))
         for given, message in (
             (X[0].to("meta"), "meta"),
+            (NESTED, "got one that is nested"),
             (torch.tensor(1.0), "at least 1 dim"),
         ):
             with pytest.raises(ValueError, match=message):

@@ -187,7 +187,10 @@ class CompiledMethod:
         """y: (..., n) -> (..., m), or trees of (B, ...)."""
         read = self._read
         if read is not None and not more and at_once(x) and _when != "never" and not tracing_now():
-            found = self._at_once.get((x.shape, x.stride(), x.dtype))
+            try:
+                found = self._at_once.get((x.shape, x.stride(), x.dtype))
+            except RuntimeError:  # neither of one that is sparse or nested
+                found = None
             if found is not None and read.unchanged(library=False) and not read.wants_gradient():
                 self.waits = False
                 return found(x)
@@ -197,8 +200,10 @@ class CompiledMethod:
         """Compute where a call is not like an earlier one that machine code has served."""
         try:
             plain = not ordinary(flatten((x, *more))[0] if more else (x,)) or x.numel() == 0 or tracing_now()
-        except RuntimeError:  # a nested tensor has no size
-            plain = True
+            if not (plain or more):
+                x.stride()
+        except RuntimeError:  # a nested tensor has no size, a sparse one no strides
+            return self._defined(x, *more)
         if plain:
             return self._exported(x, *more) if is_exporting() else self._learned(x, *more)
         if self._served is None or _when == "never":

@@ -53,6 +53,7 @@ def tensor_of(call: str, name: str, value: Any, *, recorded: bool = False) -> Te
             kind = ValueError if isinstance(error, ValueError) else kind
             told = fail(call, name, "must be a tensor or an array of numbers", value)
             raise (ValueError if isinstance(value, str) else kind)(f"{told} {error}") from error
+    found = found.resolve_neg()  # whose memory is what it says
     return found if found.is_floating_point() else found.double()
 
 
@@ -67,6 +68,7 @@ def in_place(value: Any, dtype: torch.dtype | None, shape: tuple[int, ...]) -> b
     return (
         type(value) is Tensor
         and value.dtype is dtype
+        and not value.is_nested
         and value.shape == shape
         and value.is_cpu
         and not value.requires_grad

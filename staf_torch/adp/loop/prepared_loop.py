@@ -89,7 +89,7 @@ def key_of(controller: Controller, system: Plant, cost: Cost, x0: Tensor, settin
     whose checks are not those of another call."""
     if type(x0) is not Tensor or (x0.requires_grad and torch.is_grad_enabled()):
         return None
-    ours = x0.layout is torch.strided and served((x0,)) and anybodys()
+    ours = x0.layout is torch.strided and not x0.is_nested and served((x0,)) and anybodys()
     if not ours or any(isinstance(value, Tensor | list) for value in settings):
         return None
     policy = controller.policy if type(controller) is Feedback else controller
