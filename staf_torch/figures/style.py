@@ -58,7 +58,6 @@ _DASHES: tuple[Any, ...] = (
 )  # dotted is what is ideal, true or wanted
 _PANEL = 2.2  # inches that a panel is wide, at least, with type of 8 pt
 _ROUNDING = 1e-6  # of the numbers at an axis: less is no difference
-_SHORT = 16.0  # ratio of the ends of a logarithmic axis that names more than its decades
 _ROOM = 0.12  # of an axis, between two numbers on it
 _HIGHEST = 9.0  # inches of all panels: a page
 _STRIP, _TALL = 1.35, 2.0  # inches that it is high, in one column and in several
@@ -286,7 +285,7 @@ def _widen_the_constant(figure: Figure) -> None:
 
 
 def _short_decades(figure: Figure) -> None:
-    """Name 1, 2 and 5 of each decade on a short logarithmic axis, plainly: matplotlib's names overlap."""
+    """Name 1, 2 and 5 of a logarithmic axis of at most two decades, plainly: matplotlib's names overlap."""
     from matplotlib.ticker import FuncFormatter, LogFormatterSciNotation
 
     def digit(value: float) -> str:
@@ -295,12 +294,17 @@ def _short_decades(figure: Figure) -> None:
     for axes in figure.axes:
         for axis in (axes.xaxis, axes.yaxis):
             low, high = sorted(map(abs, axis.get_view_interval()))
-            short = axis.get_scale() == "log" and 1e-4 <= low <= high <= min(_SHORT * low, 1e5)
-            if not short or not isinstance(axis.get_minor_formatter(), LogFormatterSciNotation):
+            if axis.get_scale() != "log" or not 1e-4 <= low <= high <= 1e5:
                 continue
-            inside = [digit(at) for at in axis.get_ticklocs(minor=True) if low <= at <= high]
-            inside += [digit(at) for at in axis.get_ticklocs() if low <= at <= high]
-            wanted = "125" if sum(at in "125" for at in inside) > 1 else "123456789"
+            decades, inside = (
+                [digit(at) for at in axis.get_ticklocs(minor=minor) if low <= at <= high]
+                for minor in (False, True)
+            )
+            if len(decades) > 2 or not isinstance(axis.get_minor_formatter(), LogFormatterSciNotation):
+                continue
+            inside += decades
+            choices = ("125", "12357", "123456789")
+            wanted = next((each for each in choices if sum(at in each for at in inside) > 1), choices[-1])
             names = FuncFormatter(lambda at, _, wanted=wanted: f"{at:g}" if digit(at) in wanted else "")
             axis.set_major_formatter(names)
             axis.set_minor_formatter(names)
