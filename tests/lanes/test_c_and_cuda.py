@@ -257,6 +257,8 @@ def test_a_chase_that_is_made_again_is_one_kernel() -> None:
         basis.centers.directions.mul_(0.5)
         torch.testing.assert_close(again(states), defined(states), rtol=1e-12, atol=1e-12)
     assert len(texts) == 1
+    if shutil.which("nvcc") is not None:
+        assert all(spilled == 0 for _, spilled, _ in ptxas(texts[0]).values())
 
 
 @pytest.mark.skipif(shutil.which("nvcc") is None, reason="no compiler of CUDA")

@@ -136,8 +136,8 @@ class _CudaWriter(ScalarWriter, TableWriter):
             super()._line("#pragma unroll PANELS" if "p +=" in text else "#pragma unroll")
         elif loop and int(loop[2]) > _UNROLLED:
             super()._line("#pragma unroll 4")
-        elif loop is None and text.startswith("for (int u"):  # over as much of a matrix as is left
-            super()._line("#pragma unroll 4" if text.startswith("for (int u2") else "#pragma unroll 1")
+        elif loop is None and text.startswith("for (int i0_"):  # over as much of a matrix as is left
+            super()._line("#pragma unroll 4" if text.startswith("for (int i0_2") else "#pragma unroll 1")
         super()._line(text)
 
     def _constant_array(self, name: str, kind: str, values: Iterable[str]) -> None:

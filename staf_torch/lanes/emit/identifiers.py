@@ -7,7 +7,7 @@ import zlib
 from collections.abc import Collection, Sequence
 
 _FORM = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
-_LOCAL = re.compile(r"[acilmprstyS]\d+(_\d+)?|(old|own)_.*")  # of the statements that are written
+_LOCAL = re.compile(r"[acilmprstyS]\d+(_\d+)*|(old|own)_.*")  # of the statements that are written
 _C = """alignas alignof asm auto bool break case char const constexpr continue default do double else
     enum extern false float for goto if inline int long nullptr register restrict return short signed
     sizeof static static_assert struct switch thread_local true typedef typeof typeof_unqual union
