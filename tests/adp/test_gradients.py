@@ -12,7 +12,7 @@ from helpers import tensor, uniform
 from torch import Tensor, nn
 
 import staf_torch as st
-from staf_torch import adp, online, systems
+from staf_torch import adp, lanes, online, systems
 
 COST = adp.QuadraticCost(1.0, 0.1, dim=2, inputs=1)
 PLANT = systems.Pendulum()
@@ -176,3 +176,63 @@ def test_gradients_that_are_computed_are_right(name: str) -> None:
     given = tuple(part.clone().requires_grad_() for part in at)
     assert torch.autograd.gradcheck(function, given, fast_mode=True, atol=1e-4, rtol=1e-3)
     assert not function(*at).requires_grad
+
+
+FLAT: dict[str, Callable[[Tensor], Tensor]] = {
+    "zero": lambda x: 0 * x[..., 0],
+    "linear": lambda x: x[..., 0] - 2 * x[..., 1],
+    "constant": lambda x: torch.ones_like(x[..., 0]),
+}
+DOORS: dict[str, Callable[[Callable[[Tensor], Tensor]], Tensor]] = {  # that differentiate a user's function
+    "DirectShooting terminal": lambda f: (
+        adp.DirectShooting(PLANT, COST, horizon=0.2, intervals=4, terminal=f).solve(X0[:1]).value
+    ),
+    "BoxDDP terminal": lambda f: (
+        adp.BoxDDP(adp.SampledProblem.of(PLANT, COST, dt=0.05, terminal=f), steps=3, compile=False)
+        .solve(X0)
+        .cost
+    ),
+    "hjb_residual value": lambda f: adp.hjb_residual(PLANT, COST, f, X0),
+    "AvoidanceCost obstacles": lambda f: loop(
+        cost=adp.AvoidanceCost(1.0, 1.0, 2, 1, obstacles=lambda x: f(x) + 0.5, reach=0.9)
+    ),
+    "SafetyFilter constraints": lambda f: adp.SafetyFilter(
+        wanted_control, PLANT, lambda x, t: 1 - x[..., 0] + 0.1 * f(x), dt=0.02, decay=9.0
+    )(X0),
+    "held_stability policy": lambda f: tensor(
+        [adp.held_stability(lambda x: f(x).unsqueeze(-1), PLANT, 0.1).spectral_radius]
+    ),
+    "RatePlant rate": lambda f: adp.near_optimal(
+        systems.RatePlant(
+            lambda x, u: torch.stack((x[..., 1], u[..., 0] + f(x) - f(0 * x)), -1), dim=2, inputs=1
+        ),
+        COST,
+        dt=0.1,
+        reach="local",
+    )(X0),
+    "chase target, tangent": lambda f: (
+        st.chase(
+            systems.simulate(systems.Oscillator(), X0, dt=0.1, steps=3),
+            BASIS,
+            f,
+            st.optim.SteepestDescent(),
+            predictor=st.predictors.Tangent(),
+        ).weights
+    ),
+    "StaF.gradient target": lambda f: st.StaF(BASIS).fit_(X0[0], f).gradient(X0[:1], mode="total", target=f),
+    "ChaseOptimizer loss": lambda f: st.optim.ChaseOptimizer(
+        [weights := nn.Parameter(X0.clone())], st.optim.SteepestDescent()
+    ).step(lambda: f(weights).sum() + 0 * weights.sum()),
+}
+
+
+@pytest.mark.parametrize("door", DOORS)
+@pytest.mark.parametrize("name", FLAT)
+def test_functions_that_are_linear_or_constant_are_differentiated(name: str, door: str) -> None:
+    with lanes.compiling("never"):
+        assert bool(DOORS[door](FLAT[name]).isfinite().all())
+
+
+def test_a_constant_policy_of_one_entry_for_all_rows_is_held() -> None:
+    still = adp.held_stability(lambda x: tensor([0.0]), PLANT, 0.1)
+    assert still == adp.held_stability(lambda x: 0 * x[..., :1], PLANT, 0.1)

@@ -222,7 +222,7 @@ class HeldLoop(NamedTuple):
                 at.double(),
                 torch.full_like(at, _PROBE / STEP),
             )
-            held = policy(at.unsqueeze(0))[0].double()
+            held = policy(at.unsqueeze(0)).expand(1, -1)[0].double()
         f, g, slope = (t.double().cpu() for t in (*system.linearisation(at, held), slope))
         if not bool(torch.isfinite(torch.cat((f, g, slope.mT), dim=-1)).all()):
             return cls(system, f, g, slope, False)
