@@ -28,7 +28,7 @@ starts = torch.tensor([[-1.0, 1.0], [1.0, 1.0], [0.5, -1.0], [-1.0, -0.5]]).doub
 # %% [markdown]
 # The published gains are the start; their logarithms are learned, so that they stay positive, by steps down
 # the gradient. A step that does not pay is not taken, and the next one is half as long: an actor that follows
-# its critic too fast diverges, from one of the four starts, and the cost beyond such gains is steep. The first
+# its critic too fast diverges, from one of four starts, and the cost beyond such gains is steep. The first
 # step compiles the loop and its adjoint, a later one takes a tenth of a second.
 
 
