@@ -65,16 +65,18 @@ def single(value: Any) -> Any:
 
 def in_place(value: Any, dtype: torch.dtype | None, shape: tuple[int, ...]) -> bool:
     """Return whether compiled code can read a sample where it lies, as one of this dtype and shape."""
-    return (
-        type(value) is Tensor
-        and value.dtype is dtype
-        and not value.is_nested
-        and value.shape == shape
-        and value.is_cpu
-        and not value.requires_grad
-        and value.is_contiguous()
-        and not value.is_neg()
-    )
+    try:
+        return (
+            type(value) is Tensor
+            and value.dtype is dtype
+            and value.shape == shape
+            and value.is_cpu
+            and not value.requires_grad
+            and value.is_contiguous()
+            and not value.is_neg()
+        )
+    except RuntimeError:  # a nested tensor has no shape
+        return False
 
 
 def pair(
