@@ -267,3 +267,35 @@ def test_a_trajectory_is_compiled_where_it_is_long() -> None:
     states = systems.simulate(plant, x0, dt=0.001, steps=12_000)
     few = systems.simulate(plant, x0, dt=0.001, steps=100)
     torch.testing.assert_close(states[:, :101], few, rtol=CLOSE, atol=CLOSE)
+
+
+def test_a_loop_that_runs_again_sees_what_has_changed_since(caplog: pytest.LogCaptureFixture) -> None:
+    """From the third run on its checks and its linearisation are those of the second."""
+    gain, x0 = torch.tensor([[30.0, 10.0]], dtype=torch.float64), uniform(3, 0.5)
+    plant, cost = systems.Pendulum(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+
+    def policy(x: Tensor) -> Tensor:
+        return -(x @ gain.mT)
+
+    def looped(*case: Any, dt: float = 0.01) -> adp.LoopResult:
+        return adp.simulate(*case, x0, dt=dt, steps=5, compile=False)
+
+    changes: tuple[Callable[[], Any], ...] = (
+        lambda: gain.mul_(1.5),
+        lambda: cost.q.mul_(2.0),
+        lambda: setattr(plant, "damping", 0.7),
+        lambda: gain.requires_grad_(),
+    )
+    for change in changes:
+        for _ in range(3):
+            looped(policy, plant, cost)
+        change()
+        fresh = looped(lambda x: policy(x), copy.deepcopy(plant), copy.deepcopy(cost))
+        again = looped(policy, plant, cost)
+        assert again.state.equal(fresh.state)
+        assert again.cost.equal(fresh.cost)
+    assert again.cost.requires_grad
+    caplog.clear()
+    for _ in range(4):
+        looped(policy, plant, cost, dt=0.5)
+    assert sum("is unstable" in line for line in caplog.messages) == 4
