@@ -31,6 +31,7 @@ _DRAWN = (*HISTORY, "ideal_estimate")
 _ROWS = 4096  # at most that go through time together: memory does not grow with rows
 _ON_DEVICE = 32  # times as many rows there, and as much memory: a launch costs as much for few as for many
 _FEW, _BYTES = 64, 2**26  # rows at least, and bytes at most, where a history is kept: it is written by rows
+_SEEN = 20  # pieces
 _DRAWN_TIMES = 4000  # more could not be told apart in print
 
 
@@ -147,11 +148,14 @@ def _run(
         kept = starts.shape[1] + 3 + 2 * basis.count  # numbers of a row and time, of `HISTORY`
         whole = _BYTES // (times * kept * starts.element_size())  # rows with all times
         together = min(together, max(_FEW, whole))
+        whole = chunk_length(times, basis, starts.element_size())  # rows whose times are all in one piece
+        if starts.is_cpu and len(starts) > together and whole >= _FEW:
+            together = min(together, whole)
     blocks = starts.split(together)
     few = -(-min(together, len(starts)) // share)
     chunk = chunk_length(few, basis, starts.element_size())
-    # Some twenty pieces of a long run, so that progress is seen; the results do not depend on it.
-    chunk = max(1, min(chunk, max(64, -(-times // 20))))
+    if len(blocks) < _SEEN:  # so many pieces of a long run show its progress; the results do not depend on it
+        chunk = max(1, min(chunk, max(64, -(-times // _SEEN))))
     told = alone and len(blocks) == 1  # the engine warns of the reach, else each member of its own
     done, reach = 0, torch.zeros(len(starts), dtype=starts.dtype, device=starts.device)  # largest |x| nu(x)
     with torch.no_grad(), warnings.catch_warnings():

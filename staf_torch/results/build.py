@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from .._version import __version__
+from .archives import MARK, archive_digest
 from .files import RUN
 from .untrusted import UnreadableError, all_visible, open_regular
 
@@ -28,13 +29,22 @@ _MOST_MODULES = 200
 _ABSENT = "nothing"
 
 
-def digest(path: Path) -> str:
-    """Return the SHA-256 of a regular file, which may be of any size.
+def digest(path: Path, recorded: str | None = None) -> str:
+    """Return the checksum of a regular file of any size: its SHA-256, or `archive_digest` of an `.npz`.
+
+    Args:
+        path: of the file.
+        recorded: the checksum that it had: it is compared as that was made, with all contents read.
 
     Raises:
         UnreadableError: if there is none.
     """
     with open_regular(path) as file:
+        marked = path.suffix == ".npz" if recorded is None else recorded.startswith(MARK)
+        found = archive_digest(file, thorough=recorded is not None) if marked else None
+        if found is not None:
+            return found
+        file.seek(0)
         return hashlib.file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]
 
 
@@ -272,7 +282,7 @@ def damage(directory: Path, recorded: Mapping[str, Any], *, thorough: bool) -> s
 
     Args:
         directory: of the run.
-        recorded: name of a file to its size and SHA-256.
+        recorded: name of a file to its size and checksum.
         thorough: whether to read them; else only their sizes are looked at, and whether they are there only
             where they hold numbers.
     """
@@ -284,7 +294,7 @@ def damage(directory: Path, recorded: Mapping[str, Any], *, thorough: bool) -> s
             size = path.lstat().st_size
             if size != about[0]:
                 return f"{name} is damaged: it has {size} bytes in place of {about[0]}"
-            if thorough and digest(path) != about[1]:
+            if thorough and digest(path, str(about[1])) != about[1]:
                 return f"{name} is damaged: its checksum is another one"
         except UnreadableError as error:
             return str(error)
@@ -297,7 +307,7 @@ def damage(directory: Path, recorded: Mapping[str, Any], *, thorough: bool) -> s
 def checksums(
     directory: Path, but: frozenset[str] = frozenset(), patterns: Sequence[str] = ("**/*",)
 ) -> dict[str, list[Any]]:
-    """Return size and SHA-256 of every result file in and under a run directory, by their names there."""
+    """Return size and checksum of every result file in and under a run directory, by their names there."""
     found: dict[str, list[Any]] = {}
     for path in sorted(path for pattern in patterns for path in directory.glob(pattern)):
         name = path.relative_to(directory).as_posix()

@@ -214,18 +214,12 @@ class HistoryWriter:
             self._row, self._done = row, 0
         if not self._members:
             self._reserve(pieces)
-        if any(len(held) != rows for held in self._held.values()) or not self._held:
-            size = sum(piece.nbytes for piece in pieces.values()) // max(1, length)  # of one time
-            room = rows, max(1, min(self._times, _HELD // max(1, size)))
-            self._held = {n: np.empty((*room, *piece.shape[2:]), piece.dtype) for n, piece in pieces.items()}
-        room, taken = next(iter(self._held.values())).shape[1], 0
-        while taken < length:
-            take = min(length - taken, room - self._fill)
+        if length == self._times:  # nothing is held: it goes where it stays
             for name, piece in pieces.items():
-                self._held[name][:, self._fill : self._fill + take] = piece[:, taken : taken + take]
-            taken, self._fill, self._done = taken + take, self._fill + take, self._done + take
-            if self._fill == room or self._done == self._times:
-                self._write(rows)
+                self._members[name].put(self._file, row * length, piece)
+            self._done = length
+        else:
+            self._hold(pieces, rows, length)
         if self._done == self._times:
             self._complete += rows
 
@@ -260,6 +254,21 @@ class HistoryWriter:
             self._members[name] = _Array(f"{name}.npy", begin, shape, piece.dtype)
             begin = self._members[name].end
         self._file.truncate(begin)
+
+    def _hold(self, pieces: Mapping[str, np.ndarray], rows: int, length: int) -> None:
+        """Take in a piece of time of a block of rows, and write what is held when that is enough."""
+        if any(len(held) != rows for held in self._held.values()) or not self._held:
+            size = sum(piece.nbytes for piece in pieces.values()) // max(1, length)  # of one time
+            room = rows, max(1, min(self._times, _HELD // max(1, size)))
+            self._held = {n: np.empty((*room, *piece.shape[2:]), piece.dtype) for n, piece in pieces.items()}
+        room, taken = next(iter(self._held.values())).shape[1], 0
+        while taken < length:
+            take = min(length - taken, room - self._fill)
+            for name, piece in pieces.items():
+                self._held[name][:, self._fill : self._fill + take] = piece[:, taken : taken + take]
+            taken, self._fill, self._done = taken + take, self._fill + take, self._done + take
+            if self._fill == room or self._done == self._times:
+                self._write(rows)
 
     def _write(self, rows: int) -> None:
         """Write the times that are held."""
@@ -296,7 +305,7 @@ class _Array:
 
     def put(self, file: BinaryIO, entry: int, block: np.ndarray) -> None:
         """Write a block at one of the B T entries."""
-        at, data = self._data + self._entry * entry, block.reshape(-1).view(np.uint8).data
+        at, data = self._data + self._entry * entry, _bytes(block)
         file.seek(at)
         file.write(data)
         if at == self._summed:
@@ -311,3 +320,8 @@ class _Array:
         self.info.CRC = self._sum
         file.seek(self.info.header_offset)
         file.write(self.info.FileHeader(zip64=True) + self._head)
+
+
+def _bytes(array: np.ndarray) -> memoryview:
+    """The bytes of an array, in C's order: a copy only where they do not lie so."""
+    return np.ascontiguousarray(array).reshape(-1).view(np.uint8).data

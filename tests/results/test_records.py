@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
@@ -16,6 +17,7 @@ from staf_torch import __version__
 from staf_torch.results import build, run_record
 from staf_torch.results.build import checksums, damage, damaged, differences, record_checksum, short
 from staf_torch.results.metric_info import MetricInfo
+from staf_torch.results.run_directory import HistoryWriter
 from staf_torch.results.run_record import RunRecord
 from staf_torch.sweeps.hydra_compat import parse_override
 
@@ -159,6 +161,32 @@ def test_result_files_have_checksums_and_logs_links_and_hidden_ones_none(tmp_pat
         name: [len(name), hashlib.sha256(name.encode()).hexdigest()]
         for name in ("figures/a.png", "metrics.json")
     }
+
+
+@pytest.mark.parametrize("how", ["a history", "stored", "compressed", "of earlier", "no archive"])
+def test_any_byte_of_a_history_that_changes_is_found(how: str, tmp_path: Path) -> None:
+    path, rng = tmp_path / "history.npz", np.random.default_rng(0)
+    first, second = rng.normal(size=(2, 3, 2)), np.ones((2, 3))
+    if how == "a history":
+        with HistoryWriter(path, 2, 3) as writer:
+            for row in range(2):
+                writer.add({"first": first[row : row + 1], "second": second[row : row + 1]}, row)
+            writer.close(time=np.arange(3))
+    elif how == "no archive":
+        path.write_bytes(rng.bytes(200))
+    else:
+        (np.savez_compressed if how == "compressed" else np.savez)(path, first=first, second=second)
+    content = path.read_bytes()
+    written = checksums(tmp_path)
+    if how == "of earlier":
+        written = {path.name: [len(content), hashlib.sha256(content).hexdigest()]}
+    assert damage(tmp_path, written, thorough=True) is None
+    for place in range(0, len(content), 3):
+        changed = bytearray(content)
+        changed[place] ^= 1 << place % 8
+        path.write_bytes(changed)
+        said = damage(tmp_path, written, thorough=True)
+        assert said == "history.npz is damaged: its checksum is another one", place
 
 
 # The record of a run, and of a sweep
