@@ -31,7 +31,7 @@ _DRAWN = (*HISTORY, "ideal_estimate")
 _ROWS = 4096  # at most that go through time together: memory does not grow with rows
 _ON_DEVICE = 32  # times as many rows there, and as much memory: a launch costs as much for few as for many
 _FEW, _BYTES = 64, 2**26  # rows at least, and bytes at most, where a history is kept: it is written by rows
-_SEEN = 20  # pieces
+_TIMES, _SEEN = 64, 20  # of a piece, at least; pieces
 _DRAWN_TIMES = 4000  # more could not be told apart in print
 
 
@@ -129,9 +129,11 @@ def _run(
     first, basis = members[0].problem, parts.basis
     times, starts = first.steps + 1, torch.cat([member.problem.initial_states for member in members])
     windows = [Member(m.rows, m.problem.dt, m.problem.settle_time) for m in members]
-    if rows.differ:  # in plain torch a state with numbers of its own takes several times as long
+    if (
+        rows.differ or errors is None
+    ):  # in plain torch a state with numbers of its own takes several times as long
         states = sum(window.rows * max(0, times - window.first) for window in windows)
-        errors = StateErrorPass(basis, parts.target, expected=8 * states)
+        errors = StateErrorPass(basis, parts.target, expected=8 * states if rows.differ else states)
     metrics = ChaseMetrics(
         basis,
         parts.target,
@@ -144,6 +146,8 @@ def _run(
     tell = _of_whole_problems(advance, len(starts), len(members))
     share = 1 if starts.is_cpu else _ON_DEVICE
     together = share * _ROWS
+    if starts.is_cpu:  # so few that a piece has as many times as a program needs to be worth while
+        together = min(together, max(_FEW, chunk_length(min(times, _TIMES), basis, starts.element_size())))
     if any(member.sink is not None for member in members):
         kept = starts.shape[1] + 3 + 2 * basis.count  # numbers of a row and time, of `HISTORY`
         whole = _BYTES // (times * kept * starts.element_size())  # rows with all times
@@ -155,7 +159,7 @@ def _run(
     few = -(-min(together, len(starts)) // share)
     chunk = chunk_length(few, basis, starts.element_size())
     if len(blocks) < _SEEN:  # so many pieces of a long run show its progress; the results do not depend on it
-        chunk = max(1, min(chunk, max(64, -(-times // _SEEN))))
+        chunk = max(1, min(chunk, max(_TIMES, -(-times // _SEEN))))
     told = alone and len(blocks) == 1  # the engine warns of the reach, else each member of its own
     done, reach = 0, torch.zeros(len(starts), dtype=starts.dtype, device=starts.device)  # largest |x| nu(x)
     with torch.no_grad(), warnings.catch_warnings():

@@ -45,7 +45,8 @@ class StateErrorPass:
         target: V.
         points: of the ball, at least 2.
         compile: whether to compile: ``auto`` for where it pays.
-        expected: states that will be asked for, where that is known: they then pay from the first on.
+        expected: states that will be asked for, where that is known: they then pay from the first on, or
+            from the second call where the first has to be counted.
 
     Attributes:
         compiled: whether the last call used the compiled program.
@@ -62,7 +63,7 @@ class StateErrorPass:
     ) -> None:
         self._basis, self._target, self._points, self._compile = basis, target, points, compile
         self._fixed: _Fixed | None = None
-        self._seen, self.compiled = expected, False
+        self._seen, self._expected, self.compiled = 0, expected, False
         self._share = 0.0  # of a build that a state takes in plain torch, by the operations of the first ones
         self._program: Program | None = None
 
@@ -115,7 +116,8 @@ class StateErrorPass:
         return StateErrors(*(part.reshape(shape) for part in found))
 
     def _pays(self) -> bool:
-        pays = self._seen >= _PAYS or self._seen * self._share >= 1
+        states = max(self._seen, self._expected)
+        pays = states >= _PAYS or states * self._share >= 1
         return worth(pays) if self._compile == "auto" else bool(self._compile)
 
     def _counted(self, block: tuple[Tensor, ...]) -> StateErrors:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import torch
@@ -147,16 +147,14 @@ class ChaseMetrics:
 
     def summary(self) -> dict[str, float | None]:
         """Name to number over all rows; None where there is nothing to report."""
-        return self._summary(self._whole, slice(None), self._gathered())
+        found = self._gathered()
+        (only,) = self._summaries([self._whole._replace(rows=len(found.diverged))], found)
+        return only
 
     def summaries(self) -> list[dict[str, float | None]]:
         """Name to number over the rows of each member, in the order of the members."""
         assert self._members is not None
-        summaries, start, found = [], 0, self._gathered()
-        for member in self._members:
-            summaries.append(self._summary(member, slice(start, start + member.rows), found))
-            start += member.rows
-        return summaries
+        return self._summaries(self._members, self._gathered())
 
     def _firsts(self, start: int, batch: int) -> Tensor:
         """The index of the first settled time of each of the rows from ``start`` on: (B,)."""
@@ -178,24 +176,59 @@ class ChaseMetrics:
         self._kept.fill(last, len(self._kept.diverged))
         return self._kept
 
-    def _summary(self, member: Member, rows: slice, found: _RowRecord) -> dict[str, float | None]:
-        kept = ~found.diverged[rows]
+    def _summaries(self, members: Sequence[Member], found: _RowRecord) -> list[dict[str, float | None]]:
+        """Name to number over the next rows of each member."""
+        sizes = torch.tensor([member.rows for member in members], dtype=torch.int64, device="cpu")
+        whose = torch.arange(len(members), device="cpu").repeat_interleave(sizes).to(found.diverged.device)
+        kept = ~found.diverged
+
+        def of_each(quantity: Tensor, none: float, how: str) -> list[float]:
+            """The largest or the sum over the rows of each member that did not diverge."""
+            known = torch.where(kept, quantity, torch.full_like(quantity, none))
+            start = known.new_full((len(members),), none)
+            each: list[float] = start.scatter_reduce(0, whose, known, how).tolist()
+            return each
+
+        whole = of_each(torch.ones_like(whose), 0, "sum")
+        worst = {name: of_each(column, -math.inf, "amax") for name, column in found.worst.items()}
+        counts = {
+            name: of_each(column, 0, "amax" if name == "settling_time" else "sum")
+            for name, column in found.counts.items()
+        }
+        return [
+            self._summary(
+                member,
+                found.time,
+                whole[i],
+                {name: column[i] for name, column in worst.items()},
+                {name: column[i] for name, column in counts.items()},
+            )
+            for i, member in enumerate(members)
+        ]
+
+    def _summary(
+        self,
+        member: Member,
+        times: int,
+        kept: float,
+        worst: Mapping[str, float],
+        counts: Mapping[str, float],
+    ) -> dict[str, float | None]:
+        """Name to number of a member of whose rows so many did not diverge, by their reductions."""
         metrics: dict[str, float | None] = dict.fromkeys((*_WORST, *(metric.name for metric in self._own)))
-        any_time = found.time > member.first and bool(kept.any())
+        any_time = times > member.first and kept > 0
         if any_time:
-            metrics |= {name: float(worst[rows][kept].max()) for name, worst in found.worst.items()}
+            metrics |= worst
         for metric in self._own:
-            worst = metrics[metric.name]
-            metrics[metric.name] = None if worst is None else metric.from_badness(worst)
+            bad = metrics[metric.name]
+            metrics[metric.name] = None if bad is None else metric.from_badness(bad)
         metrics |= {"settling_time": None, "contraction_violations": None}
-        if found.time > member.first:
-            for name, count in found.counts.items():
-                metrics[name] = float(count[rows][kept].sum()) if any_time else None
+        if times > member.first:
+            metrics |= {name: float(count) if any_time else None for name, count in counts.items()}
         if any_time:
-            last = found.counts.get("settling_time")
-            above = 0.0 if last is None or member.first <= 0 else float(last[rows][kept].max())
-            metrics["settling_time"] = above * member.dt
-        metrics["diverged_fraction"] = float(found.diverged[rows].double().mean())
+            last = counts.get("settling_time", 0.0) if member.first > 0 else 0.0
+            metrics["settling_time"] = float(last) * member.dt
+        metrics["diverged_fraction"] = (member.rows - kept) / member.rows
         return {k: v if v is not None and math.isfinite(v) else None for k, v in metrics.items()}
 
 

@@ -33,6 +33,8 @@ _KEPT_BYTES = 2**28
 """What the jobs of a chunk may keep until they are written."""
 _CHUNK = 128
 """Jobs of a chunk where nobody says otherwise: what is done is written that much later."""
+_LIGHT, _MANY = 2**24, 1024
+"""Bytes that many jobs may keep together to be of one chunk all the same, and how many."""
 _UNREADABLE = (ValueError, TypeError, KeyError, AttributeError, OmegaConfBaseException)
 """What broken settings raise while they are grouped. The job itself says later what is wrong with it."""
 USER_ERRORS = (ValueError, HydraException, OmegaConfBaseException, OSError, LostError)
@@ -104,19 +106,23 @@ def groups(settings: Sequence[Flat]) -> list[list[int]]:
     return found
 
 
-def batches(settings: Sequence[Flat], *, least: int = 1, most: int | None = None) -> list[list[int]]:
+def batches(
+    settings: Sequence[Flat], *, least: int = 1, most: int | None = None, measured: bool = False
+) -> list[list[int]]:
     """Return the indices of every tensor batch, in order; what a batch keeps fits into memory together.
 
     Args:
         settings: of all jobs.
         least: so many batches at least, where that can be, to keep that many workers busy.
         most: jobs of a batch at most; None for as many as memory allows, 128 at most.
+        measured: whether metrics are all that is wanted: light jobs are then up to a thousand a batch.
     """
     grouped, sizes = _grouped(settings)
+    light = _LIGHT if measured and most is None else 0
     found = []
     for group in grouped:
         length = min(most or len(group), -(-len(group) * len(grouped) // least))
-        for chunk in _chunks(sizes, group, most or _CHUNK):
+        for chunk in _chunks(sizes, group, most or _CHUNK, light):
             found += [chunk[i : i + length] for i in range(0, len(chunk), length)]
     return sorted(found)
 
@@ -132,12 +138,23 @@ def _grouped(settings: Sequence[Flat]) -> tuple[list[list[int]], list[int]]:
     return list(found.values()), sizes
 
 
-def _chunks(sizes: Sequence[int], indices: Sequence[int], most: int) -> list[list[int]]:
-    """The indices of a group in pieces of ``most`` at most that fit into memory together."""
+def are_light(settings: Sequence[Flat]) -> bool:
+    """Return whether so many jobs keep little, as they all say: they are computed in no time."""
+    _, sizes = _grouped(settings)
+    return all(sizes) and sum(sizes) <= _LIGHT
+
+
+def _chunks(sizes: Sequence[int], indices: Sequence[int], most: int, light: int) -> list[list[int]]:
+    """The indices of a group in pieces that fit into memory together.
+
+    Each has ``most`` jobs at most, or up to `_MANY` that keep something, and all of them no more than ``light``.
+    """
     parts: list[list[int]] = []
     total = 0
     for index in indices:
-        if not parts or len(parts[-1]) >= most or total + sizes[index] > _KEPT_BYTES:
+        size, count = sizes[index], len(parts[-1]) if parts else 0
+        full = count >= most and not (count < _MANY and 0 < size <= light - total)
+        if not parts or full or total + size > _KEPT_BYTES:
             parts.append([])
             total = 0
         parts[-1].append(index)

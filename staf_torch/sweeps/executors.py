@@ -66,7 +66,7 @@ def compute(
         measured: whether metrics are all that is wanted of a job in a batch.
         tell: is told how many jobs are computed, with fractions while this process computes a batch.
     """
-    planned = batches(flat, least=workers.pieces, most=most)
+    planned = batches(flat, least=workers.pieces, most=most, measured=measured)
     planned = [batch for batch in planned if not set(finished).issuperset(batch)]
     _log.log(
         logging.DEBUG if measured else logging.INFO,

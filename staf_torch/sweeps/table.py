@@ -29,7 +29,7 @@ from ..results.untrusted import UnreadableError, parse_object, read_lines
 from ..settings.chase import make_metrics, units_of
 from ..settings.plain import ManySettings
 from . import workers
-from .batching import Computed, Failed, Outcome, Written, completion, reason
+from .batching import Computed, Failed, Outcome, Written, are_light, completion, reason
 from .executors import Executor, compute
 from .hydra_compat import SweepJobs
 from .job import recorded
@@ -42,6 +42,7 @@ _HEAD = f'{{"version": {json.dumps(__version__)}, "rows": [\n'
 _DIGITS = 16  # of the hash of what made a row: enough to tell two settings apart
 _PIECE = 1024  # jobs that are composed and written together: memory does not grow with their number
 _AHEAD = 8  # pieces that are composed together, at most, where several workers compute them
+_LIGHT = 4  # times as many jobs where they are light
 _SILENT = Progress(lambda share: None)
 
 Write = Callable[[Sequence[Mapping[str, Any]], Sequence[str]], None]
@@ -98,6 +99,9 @@ def fill(
         return jobs.many([[*job, *fixed] for job in overrides[begin : begin + piece]])
 
     first = composed(0)  # before anything is written: most wrong names are refused here
+    if piece < len(overrides) and most is None and not keep and are_light(first[1]):
+        piece *= _LIGHT
+        first = composed(0)
     for begin in range(0, done, piece):
         _, flat = composed(begin) if begin else first
         _refuse_others(overrides, begin, flat, before.made[begin : begin + piece])
