@@ -147,7 +147,7 @@ def are_light(settings: Sequence[Flat]) -> bool:
 def _chunks(sizes: Sequence[int], indices: Sequence[int], most: int, light: int) -> list[list[int]]:
     """The indices of a group in pieces that fit into memory together.
 
-    Each has ``most`` jobs at most, or up to `_MANY` that keep something, and all of them no more than ``light``.
+    Each has ``most`` jobs at most, or up to `_MANY` that keep no more than ``light`` bytes together.
     """
     parts: list[list[int]] = []
     total = 0
