@@ -89,7 +89,7 @@ def _imports(module: str) -> dict[str, tuple[str, str]]:
     file = _file(module)
     assert file is not None
     inside = module.split(".") if file.name == "__init__.py" else module.split(".")[:-1]
-    found = {}
+    found: dict[str, tuple[str, str]] = {}
     for node in ast.walk(_tree(module)):
         if isinstance(node, ast.ImportFrom) and node.level:
             base = ".".join([*inside[: len(inside) - node.level + 1], *filter(None, [node.module])])
