@@ -9,7 +9,7 @@ import time
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ..approximation.basis import StaFBasis
 from ..centers import StateFollowingCenters, cross_polytope
@@ -17,14 +17,16 @@ from ..kernels import ExponentialKernel
 from ..lanes import ready, where_rows
 from ..lanes.gradients import defer_gradient, marked, without_gradient
 from ..lanes.opaque import opaque
-from ..lanes.row_objects import refuse_rows
+from ..lanes.row_decisions import at_once, is_of_rows, most_of_rows, numbers_of_rows
+from ..lanes.row_numbers import in_use, rows_by_kind, rows_of_numbers, some_rows, spread_rows, tried
+from ..lanes.row_objects import Kind, kinds_of_rows, of_kinds, refuse_rows, row_of, whichever
 from ..numerics.checks import choice, flag, integer, positive_real
 from ..numerics.default_device import beside
 from ..numerics.shown import shown, sizes
 from ..signs import Sign
 from ..systems import Plant
 from ..systems.bounds import Limit
-from .loop.controller import LQR, Controller, Feedback
+from .loop.controller import LQR, Controller, ControllerOfKinds, Feedback
 from .loop.simulation import simulate
 from .planning.global_value import GlobalValue
 from .planning.global_value_sizes import box_of
@@ -34,9 +36,9 @@ from .policies.rollout import ball_directions
 from .policies.sampled_rollout import SampledRollout
 from .problem.cost import Cost
 from .problem.held_linear import held_stability
-from .problem.rules import check_endless, check_still, held_period, regulated, slowest, warn_if_short
+from .problem.rules import check_endless, check_still, check_torch, held_period, regulated, slowest, warn_if_short
 from .problem.sampled import SampledProblem
-from .reach import Reach, arrived, drawn, extended
+from .reach import Reach, arrived, drawn, extended, looked, whole
 
 _log = logging.getLogger(__name__)
 _DECAY = 2.0  # time constants of the slowest mode of the LQR in the horizon
@@ -49,6 +51,7 @@ _SHORTER = 0.75  # of the run, where that is of few states: the slowest mode fal
 _SETTLED = 9.2  # time constants for which the loops of a report run: the slowest mode falls to 1e-4
 _TRIES, _PATIENCE = 8, 1.0  # controls, and s, after which a simulator is called slow
 _SHARE = 0.5  # of a period that a control may take without a warning: another half for a slower moment
+_Given = tuple[Plant, Cost, Limit, Limit, float]
 _WAYS = ("auto", "local", "global")
 
 
@@ -66,6 +69,7 @@ class NearOptimal(SampledRollout):
         plan: whether to plan where the LQR would meet a bound.
     """
 
+    largest = ("steps",)
     def __init__(
         self,
         basis: StaFBasis,
@@ -83,6 +87,7 @@ class NearOptimal(SampledRollout):
         self.lqr, self.radius, self.substeps, self.plan = lqr, radius, self.holding.steps, plan
         self._planners: dict[Any, BoundedPlans] = {}  # each has programs, which take seconds
         self.memory: GlobalValue | None = None
+        self.kinds = nn.ModuleList()
         self.box = box_of(plant, lqr.cost.dim)
         self.reach = Reach("local", tuple(self.box.tolist()), None, None, None)
 
@@ -93,7 +98,9 @@ class NearOptimal(SampledRollout):
 
     @opaque
     def forward(self, x: Tensor) -> Tensor:
-        """u: (..., n) -> (..., m)."""
+        """u: (..., n) -> (..., m); with numbers of rows (B, ..., n)."""
+        if len(self.kinds):
+            return self._by_kind("__call__", x, self.cost.inputs)
         # Without plans it has a derivative with respect to x.
         late = defer_gradient("near_optimal(plan=True)", x=x) if self.plan else ()
         if late or (self.lqr.layers and torch.is_grad_enabled() and not x.requires_grad):
@@ -112,13 +119,37 @@ class NearOptimal(SampledRollout):
 
     def value(self, x: Tensor) -> Tensor:
         """Return the cost that the chosen control promises: (..., n) -> (...)."""
+        if len(self.kinds):
+            return self._by_kind("value", x, 0)
         return super().value(x) if self.memory is None else self.memory.value(x)
+
+    @classmethod
+    def of_kinds(cls, kinds: list[Kind]) -> NearOptimal:
+        """Return the policy of rows that are of several kinds: steps of integration, global values."""
+        made: NearOptimal = of_kinds(kinds)
+        made.memory, made._planners = None, {}
+        return made
+
+    def _by_kind(self, name: str, x: Tensor, size: int) -> Tensor:
+        """Return what a method of the kind of every row returns: (B, ..., n) -> (B, ..., size), or (B, ...)."""
+        kind, methods = self.get_buffer("kind"), [getattr(each, name) for each in self.kinds]
+        x = x if x.dim() > 1 else x.expand(rows_of_numbers(kind), -1)
+        like = x.new_zeros(*x.shape[:-1], *([size] if size else []))
+        if not in_use():
+            return whichever(kind, methods, x, like)
+        for rows, method in zip(rows_by_kind(kind, len(x), len(methods)), methods, strict=True):
+            if len(rows):
+                with some_rows(rows):
+                    like = like.index_copy(0, rows.to(x.device), method(x[rows.to(x.device)]))
+        return like
 
     def controller(self) -> Controller:
         """Return the controller for loops: the policy, and where the LQR, followed from there, would meet a
         bound of the inputs, a plan that is carried as long as this lasts. With ``plan`` a `RecedingHorizon`,
         which carries its plan all the time, the first one the best of several. With a global value the
-        policy alone."""
+        policy alone. Rows with numbers of their own plan as far as the slowest of them needs."""
+        if len(self.kinds):
+            return ControllerOfKinds([each.controller() for each in self.kinds], self.get_buffer("kind"))
         if self.memory is not None:
             return Feedback(self)
         if (planner := self.planner) is not None:
@@ -150,13 +181,17 @@ class NearOptimal(SampledRollout):
             return None
         steps = self.steps
         if constants is not None:
-            decay = slowest(self.lqr, self.plant, self.cost, self.period)
-            steps = max(steps, _periods(constants / decay, self.period))
+            steps = max(steps, self._ahead(constants))
         key = steps, self.plant, self.cost
         if key not in self._planners:
             problem = SampledProblem.of(self.plant, self.cost, dt=self.period)
             self._planners[key] = BoundedPlans(problem, steps, self)
         return self._planners[key]
+
+    def _ahead(self, constants: float) -> int:
+        """Return the periods in so many time constants of the slowest mode, of rows the most."""
+        (decays,) = numbers_of_rows(lambda: (slowest(self.lqr, self.plant, self.cost, self.period),)).numbers
+        return int(_periods(constants / decays, self.period).max())
 
     @Sign("policy.report()")
     @beside
@@ -198,6 +233,7 @@ class NearOptimal(SampledRollout):
             ``controller()`` plans; None without bounds or a plant in torch; ``left_out``, what is None
             because it was not asked for, and how to ask for it.
         """
+        refuse_rows("NearOptimal.report", plant=self.plant, cost=self.cost)
         width = positive_real("report", "spread", self.plant.spread if spread is None else spread)
         count = self._few() if states is None else integer("report", "states", states, least=1)
         x0 = drawn(self.cost, self.box if spread is None else self._box(width), count, seed)
@@ -267,7 +303,7 @@ class NearOptimal(SampledRollout):
     @property
     def settles(self) -> int:
         """Periods after which the slowest mode of the LQR has fallen to 1e-4, or plans have arrived."""
-        periods = math.ceil(_SETTLED / slowest(self.lqr, self.plant, self.cost, self.period) / self.period)
+        periods = int(_settling(slowest(self.lqr, self.plant, self.cost, self.period), self.period))
         return periods if self.memory is None else max(periods, 2 * self.memory.library.control.shape[1])
 
     def _good(self, fine: Tensor, states: int, width: float, seed: int) -> float:
@@ -380,7 +416,52 @@ def near_optimal(
             is no global value; the message says why.
     """
     choice("near_optimal", "reach", reach, _WAYS)
-    refuse_rows("near_optimal", plant=plant, cost=cost)
+
+    def local(plant: Plant, cost: Cost, low: Limit, high: Limit, radius: float) -> NearOptimal:
+        return _local(plant, cost, dt, low, high, radius, horizon, plan, substeps)
+
+    def single(given: _Given) -> NearOptimal:
+        policy = local(*given)
+        if reach != "local":
+            policy.reach, policy.memory = extended(policy, policy.lqr, policy.box, policy.settles, reach)
+        return policy
+
+    def looked_at() -> tuple[NearOptimal, bool]:
+        policy = local(*given)
+        if reach != "auto":
+            return policy, reach == "global"
+        decay = slowest(policy.lqr, plant, policy.cost, policy.period)
+        found = looked(policy, policy.lqr, policy.box, _settling(decay, policy.period), reach)
+        policy.reach = whole(policy.box) if found is None else found.reach or policy.reach
+        return policy, found is not None and found.reach is None
+
+    given = plant, cost, low, high, radius
+    policy, count = tried(lambda: single(given))
+    if count is None:
+        assert policy is not None
+        return policy
+    check_torch("near_optimal", "plant", plant)
+    parts = at_once(looked_at, count, spread_rows(count))
+    kept = [part for part in parts if not part.found[1]]
+    kinds = kinds_of_rows([part.found[0] for part in kept], [part.rows for part in kept], count)
+    for row in sorted(row for part in parts if part.found[1] for row in part.rows.tolist()):
+        alone = single(row_of(given, row))  # a global value is of one problem
+        kinds.append(Kind(torch.tensor([row], dtype=torch.int64, device="cpu"), alone))
+    return kinds[0].object if len(kinds) == 1 < count else NearOptimal.of_kinds(kinds)
+
+
+def _local(
+    plant: Plant,
+    cost: Cost,
+    dt: float | None,
+    low: Limit,
+    high: Limit,
+    radius: float,
+    horizon: float | None,
+    plan: bool,
+    substeps: int | None,
+) -> NearOptimal:
+    """Return the local policy; arguments as those of `near_optimal`."""
     period = held_period("near_optimal", plant, dt)
     check_still("near_optimal", "plant", plant, "`RecedingHorizon` or `LQR`")
     check_endless("near_optimal", "cost", cost.ending, "the policy knows no end; plans do, `RecedingHorizon`")
@@ -388,8 +469,10 @@ def near_optimal(
     lqr = LQR(plant, placed, period=period)
     decay = slowest(lqr, plant, placed, period)
     constants = _PLANNED if flag("near_optimal", "plan", plan) else _DECAY
+    counted = None
     if horizon is None:
-        steps = _periods(constants / decay, period)
+        wanted = _periods(constants / decay, period)
+        steps, counted = most_of_rows(wanted), wanted / 4 if is_of_rows(wanted) else None
     else:
         steps = round(positive_real("near_optimal", "horizon", horizon) / period)
         warn_if_short("near_optimal", "horizon", horizon, decay)
@@ -398,16 +481,22 @@ def near_optimal(
     directions = along if placed.inputs <= placed.dim else ball_directions(None, placed.dim)
     basis = StaFBasis(ExponentialKernel(), StateFollowingCenters(directions, radius))
     policy = NearOptimal(basis, plant, lqr, steps=steps, substeps=substeps, radius=radius, plan=plan)
+    if counted is not None:
+        policy.counted = True
+        policy.register_buffer("quarter", counted)
     if not plant.traceable:
         _warn_if_slow(policy)
-    if reach != "local":
-        policy.reach, policy.memory = extended(policy, lqr, policy.box, policy.settles, reach)
     return policy
 
 
-def _periods(seconds: float, period: float) -> int:
+def _periods(seconds: Tensor, period: float) -> Tensor:
     """Periods in a horizon, a multiple of four: a compiled rollout contains one quarter and loops over it."""
-    return min(max(-(-round(seconds / period) // 4) * 4, _STEPS[0]), _STEPS[1])
+    return (((seconds / period).round() / 4).ceil() * 4).clamp(*_STEPS)
+
+
+def _settling(decay: Tensor, period: float) -> Tensor:
+    """Periods after which the slowest mode, of a decay in 1/s, has fallen to 1e-4."""
+    return (_SETTLED / decay / period).ceil()
 
 
 def _warn_if_slow(policy: NearOptimal) -> None:

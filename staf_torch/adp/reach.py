@@ -10,6 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ..lanes.row_decisions import in_any_row, is_of_rows, of_first, rows_of
 from ..numerics.checks import fail
 from ..systems import Bounds, Linear, Plant
 from ..systems.user_plants import FunctionPlant
@@ -38,9 +39,9 @@ class Reach(NamedTuple):
 
     way: str  # ``local``: the LQR and its rollouts; ``global``: a memory of optimal trajectories
     box: tuple[float, ...]  # half widths, in units of the state
-    regulated: float | None  # share of a sample that ends within 1 % of where it began; None: nobody looked
+    regulated: float | Tensor | None  # share of a sample that ends within 1 % of where it began; None: nobody looked
     over_best: float | None  # mean cost over that of the best trajectories known, of the regulated
-    base: float | None  # share that the LQR within its bounds regulates
+    base: float | Tensor | None  # share that the LQR within its bounds regulates
     note: str = ""  # why nobody looked, or why there is no global value
 
 
@@ -65,6 +66,48 @@ def arrived(cost: Cost, x: Tensor, x0: Tensor) -> Tensor:
     return close
 
 
+def whole(box: Tensor) -> Reach:
+    """The reach of an LQR that regulates all of a box by nature."""
+    return Reach("local", tuple(box.tolist()), 1.0, None, 1.0)
+
+
+class Looked(NamedTuple):
+    """How far a base leads from a sample of the box."""
+
+    reach: Reach | None  # None where a global value is wanted
+    base: Followed
+    share: Tensor  # () that is regulated
+
+
+def looked(policy: SampledRollout, lqr: LQR, box: Tensor, settles: Tensor, way: str) -> Looked | None:
+    """Follow a base from a sample of the box; None where it regulates all by nature.
+
+    Args:
+        policy: with the base.
+        lqr: the base itself.
+        box: half widths, (n,).
+        settles: periods after which the slowest mode of the base has fallen to 1e-4, ().
+        way: ``auto`` or ``global``.
+    """
+    cost, x0, widths = policy.cost, sample(policy.cost, box), tuple(box.tolist())
+    if type(policy.plant) is Linear and not policy.bounds.present and way == "auto":
+        return None
+    base = follow_base(policy, x0, 2 * settles)
+    share = base.regulated.double().mean()
+    kept = share if is_of_rows(share) else float(share)
+    if way == "auto" and not base.known:
+        _log.warning(
+            "near_optimal did not look how far the LQR leads: to follow it from %d states of the box %s "
+            "takes longer than 0.4 s (%.0f %% had arrived by then). `report()` looks.",
+            *(len(x0), _shown(box), 100 * float(of_first(share))),
+        )
+        note = "the simulation of the LQR was stopped after 0.4 s"
+        return Looked(Reach("local", widths, None, None, None, note), base, share)
+    dear = policy.bounds.present & (base.cost > _DEAR * lqr.value(x0))
+    good = way == "auto" and bool((base.regulated & ~dear).all())
+    return Looked(Reach("local", widths, kept, None, kept) if good else None, base, share)
+
+
 def extended(
     policy: SampledRollout, lqr: LQR, box: Tensor, settles: int, way: str
 ) -> tuple[Reach, GlobalValue | None]:
@@ -81,21 +124,10 @@ def extended(
         ValueError: if the way is ``global`` and there is no global value.
     """
     cost, x0, widths = policy.cost, sample(policy.cost, box), tuple(box.tolist())
-    if type(policy.plant) is Linear and not policy.bounds.present and way == "auto":
-        return Reach("local", widths, 1.0, None, 1.0), None
-    base = follow_base(policy, x0, 2 * settles)
-    share = float(base.regulated.double().mean())
-    if way == "auto" and not base.known:
-        _log.warning(
-            "near_optimal did not look how far the LQR leads: to follow it from %d states of the box %s "
-            "takes longer than 0.4 s (%.0f %% had arrived by then). `report()` looks.",
-            *(len(x0), _shown(box), 100 * share),
-        )
-        note = "the simulation of the LQR was stopped after 0.4 s"
-        return Reach("local", widths, None, None, None, note), None
-    dear = policy.bounds.present & (base.cost > _DEAR * lqr.value(x0))
-    if way == "auto" and bool((base.regulated & ~dear).all()):
-        return Reach("local", widths, share, None, share), None
+    found = looked(policy, lqr, box, torch.tensor(float(settles), dtype=torch.float64), way)
+    if found is None or found.reach is not None:
+        return (whole(box) if found is None else found.reach), None
+    base, share = found.base, float(found.share)
     try:
         problem = sampled_problem(policy.plant, cost, policy.period, x0)
         _log.info(
@@ -144,20 +176,34 @@ class Followed(NamedTuple):
 
 
 @torch.no_grad()
-def follow_base(policy: SampledRollout, x0: Tensor, periods: int) -> Followed:
-    """Follow the base of a policy, within its bounds, from x0 (B, n), for 0.4 s of computing at most."""
+def follow_base(policy: SampledRollout, x0: Tensor, periods: Tensor) -> Followed:
+    """Follow the base of a policy, within its bounds, from x0 (B, n), for 0.4 s of computing at most.
+
+    Args:
+        policy: with the base.
+        x0: (B, n).
+        periods: at most, ().
+    """
     x, paid, began, since = x0, torch.zeros_like(x0[:, 0]), time.thread_time(), time.monotonic()
-    good, known = torch.zeros_like(paid, dtype=torch.bool), False
-    for k in range(1, periods + 1):
-        x, spent = policy.holding(x, policy.bounds.clip(policy.base(x)))
-        x, paid = torch.where(torch.isfinite(x).all(-1, keepdim=True), x, torch.nan), paid + spent
-        late = time.thread_time() - began > _BUDGET or time.monotonic() - since > _PATIENCE
-        if k % _LOOK == 0 or k == periods or late:
-            good = arrived(policy.cost, x, x0)
-            known = k == periods or bool((good | x.isnan().any(-1)).all())
-            if known or late:  # saves time: nothing more will change, or there is none
+    good, known, k, problems = torch.zeros_like(paid, dtype=torch.bool), paid[0] < 0, 0, rows_of(policy.metric)
+    while in_any_row(~known):
+        k += 1
+        moved, spent = policy.holding(x, policy.bounds.clip(policy.base(x)))
+        moved = torch.where(torch.isfinite(moved).all(-1, keepdim=True), moved, torch.nan)
+        # What is known of a problem does not change while others go on.
+        x, paid = torch.where(known, x, moved), torch.where(known, paid, paid + spent)
+        late = (
+            time.thread_time() - began > problems * _BUDGET or time.monotonic() - since > problems * _PATIENCE
+        )
+        if k % _LOOK == 0 or late or in_any_row(periods == k):
+            here = arrived(policy.cost, x, x0)
+            every = k % _LOOK == 0 or late
+            now = (k >= periods) | ((here | x.isnan().any(-1)).all() & every)
+            good = torch.where(known | ~((k >= periods) | every), good, here)
+            known = known | now
+            if late:
                 break
-    return Followed(good, paid, known)
+    return Followed(good, paid, bool(known))
 
 
 def sampled_problem(plant: Plant, cost: Cost, period: float, x: Tensor) -> SampledProblem:

@@ -88,6 +88,25 @@ def _chosen(going: Tensor, after: Tree, before: Tree) -> Tree:
     return unflatten(structure, iter(picked))
 
 
+def repeat_counted(most: int, count: Tensor, body: Callable[[Tree], Tree], start: Tree) -> Tree:
+    """Apply body to start as often as a row's own ``count``, (), says, at most ``most`` times.
+
+    Args:
+        most: passes.
+        count: of a row, floating-point.
+        body: of a tree of tensors (B, ...) to one.
+        start: of which the first tensor has the rows.
+    """
+    first = flatten(start)[0][0]
+    none = torch.zeros_like(first.reshape(len(first), -1)[:, 0])
+
+    def counted(now: tuple[Tree, Tensor]) -> tuple[Tree, Tensor]:
+        return body(now[0]), now[1] + 1
+
+    found: Tree = repeat(most, counted, (start, none), where=lambda now: now[1] < count)[0]
+    return found
+
+
 def where_rows(where: Tensor, body: Callable[[Tree], Some], given: Tree, otherwise: Some) -> Some:
     """body(given) in the rows where ``where`` holds, ``otherwise`` in the others.
 

@@ -142,8 +142,39 @@ def numbers_of_rows(function: Callable[[], tuple[Tensor, ...]], most: int | None
     return NumbersOfRows(found, rows, count)
 
 
-def is_of_rows(tensor: Tensor) -> bool:
-    """Return whether a tensor stands for those of many rows of a `torch.func.vmap`."""
+def spread_object(value: Some, rows: Tensor, count: int) -> Some:
+    """Return an object with numbers of these rows (R,) as one with numbers of all: others have the first's."""
+    place = torch.zeros(count, dtype=torch.int64, device="cpu")
+    place[rows] = torch.arange(len(rows), device="cpu")
+
+    def change(part: Any) -> Any:
+        if not isinstance(part, RowNumbers) or len(part.full) != len(rows):
+            return part
+        return RowNumbers(part.full[place.to(part.full.device)])
+
+    return value if len(rows) == count else _changed(value, change)  # type: ignore[no-any-return]
+
+
+def of_first(tensor: Tensor) -> Tensor:
+    """Return the number of the first of many rows, for a message; a tensor of none as it is."""
+    values = _values(tensor)
+    return tensor if values is None else values[0]
+
+
+def most_of_rows(count: Tensor) -> int:
+    """Return the largest of the counts of all rows, (): that of a loop which rows share."""
+    values = _values(count)
+    return int(count if values is None else values.max())
+
+
+def rows_of(tensor: Tensor) -> int:
+    """Return of how many rows a tensor stands for the numbers; 1 of none."""
+    values = _values(tensor)
+    return 1 if values is None else len(values)
+
+
+def is_of_rows(tensor: Any) -> bool:
+    """Return whether a tensor (or anything else) stands for those of many rows of a `torch.func.vmap`."""
     return _values(tensor) is not None
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import abc
 import contextlib
+import copy
 import functools
 import inspect
 import sys
@@ -17,15 +18,16 @@ import threading
 import weakref
 from collections.abc import Callable, Sequence
 from types import CellType, FrameType, FunctionType, MethodType
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from .contents import BOUND, Contents, Derived
-from .row_decisions import at_once, is_of_rows
+from .loops import where_rows
+from .row_decisions import at_once, is_of_rows, spread_object
 from .row_numbers import RowNumbers, all_rows, beside, in_use, over_rows, spread_rows, tried
-from .tree import Shared, plain
+from .tree import Shared, flatten, plain
 
 Some = TypeVar("Some")
 Given = ParamSpec("Given")
@@ -113,11 +115,69 @@ def made_by_rows(make: Callable[[], Some]) -> Some:
     if len(parts) == 1 and parts[0].together:
         return parts[0].found  # type: ignore[no-any-return]
     objects, rows = [part.found for part in parts], [part.rows for part in parts]
-    made: Some = merged(objects, rows)
+    try:
+        made: Some = merged(objects, rows)
+    except ValueError:
+        join = getattr(type(objects[0]), "of_kinds", None)
+        if join is None:
+            raise
+        return join(kinds_of_rows(objects, rows, count))  # type: ignore[no-any-return]
     if any(isinstance(tensor, RowNumbers) for tensor in Contents(made).tensors):
         return made
     made = merged(objects, rows, beside(make))  # as many rows as there are, although all are alike
     return made
+
+
+class Kind(NamedTuple):
+    """An object of some rows that are alike in all but numbers."""
+
+    rows: Tensor  # (R,)
+    object: Any  # with the numbers of all B rows, of which those of other rows are the first one's
+
+
+def kinds_of_rows(objects: Sequence[Any], rows: Sequence[Tensor], count: int) -> list[Kind]:
+    """Return objects merged where they are alike in all but numbers.
+
+    Args:
+        objects: of one class.
+        rows: of each, (R,).
+        count: B.
+    """
+    groups = list[tuple[list[Any], list[Tensor], Any]]()
+    for one, part in sorted(zip(objects, rows, strict=True), key=lambda pair: int(pair[1][0])):
+        for k, (several, parts, _) in enumerate(groups):
+            with contextlib.suppress(ValueError):
+                joined = _Merge([*parts, part], count).of([*several, one], type(one).__name__)
+                groups[k] = ([*several, one], [*parts, part], joined)
+                break
+        else:
+            groups.append(([one], [part], None))
+    return [
+        Kind(torch.cat(parts), joined if len(parts) > 1 else spread_object(several[0], parts[0], count))
+        for several, parts, joined in groups
+    ]
+
+
+def of_kinds(kinds: Sequence[Kind]) -> Any:
+    """Return a copy of the first kind's module that has all of them as ``kinds``, and as its buffer ``kind``
+    which of them a row is."""
+    first, count = kinds[0].object, sum(len(kind.rows) for kind in kinds)
+    made = object.__new__(type(first))
+    vars(made).update({name: copy.copy(value) for name, value in vars(first).items() if name != BOUND})
+    which = torch.zeros(count, dtype=torch.float64, device="cpu")
+    for k, kind in enumerate(kinds):
+        which[kind.rows] = float(k)
+    made.kinds = nn.ModuleList(kind.object for kind in kinds)
+    made.register_buffer("kind", RowNumbers(which))
+    return made
+
+
+def whichever(kind: Tensor, bodies: Sequence[Callable[[Any], Any]], given: Any, like: Any) -> Any:
+    """Return what the function of a row's kind returns, trees (B, ...) to (B, ...), as ``like`` where none is."""
+    count = len(flatten(given)[0][0])
+    for k, body in enumerate(bodies):
+        like = where_rows((kind == k).expand(count), body, given, like)
+    return like
 
 
 class Note(str):
@@ -272,9 +332,9 @@ def merged(objects: Sequence[Some], rows: Sequence[Tensor] | None = None, other:
 class _Merge:
     """Merges objects, each with the numbers of these rows; one more may say which numbers are of rows."""
 
-    def __init__(self, rows: Sequence[Tensor]) -> None:
+    def __init__(self, rows: Sequence[Tensor], count: int | None = None) -> None:
         self._rows = rows
-        self._count = sum(map(len, rows))
+        self._count = sum(map(len, rows)) if count is None else count
         self._made: dict[tuple[int, ...], Any] = {}
         self._kept: list[Any] = []  # addresses are used once
 
@@ -311,7 +371,8 @@ class _Merge:
             return first
         if not first.is_floating_point():
             raise self._differ(values, name)
-        full = all_rows(first).detach().new_empty(self._count, *first.shape)
+        start = all_rows(first).detach()[:1] if isinstance(first, RowNumbers) else first.detach()
+        full = start.expand(self._count, *first.shape).clone()
         for value, rows in zip(values, self._rows, strict=False):
             part = all_rows(value).detach()  # of all rows where it was not made for these
             full[rows] = part[rows] if isinstance(value, RowNumbers) and len(part) != len(rows) else part
@@ -347,6 +408,10 @@ class _Merge:
                 there: Any = next((each[key] for each in held if each[key] is not None), None)
                 for each in held if there is not None else ():
                     each[key] = torch.zeros_like(there) if each[key] is None else each[key]
+            for key in getattr(kind, "largest", ()):  # counts of loops that rows leave earlier
+                most = max(each[key] for each in held)
+                for each in held:
+                    each[key] = most
             vars(made).update(self._dict(held, name))
             return made
         if all(value == first for value in values) or (isinstance(first, Note) and all(values)):
@@ -390,6 +455,28 @@ class _Merge:
             f"rows differ in `{name}`, which is no number: {values[0]!r} in row {first} and "
             f"{values[other]!r} in row {row}; what is no number must be the same in all rows."
         )
+
+
+class _Alone(_Merge):
+    """Copies an object of many rows with the numbers of one."""
+
+    def of(self, values: list[Any], name: str) -> Any:
+        first = values[0]
+        if isinstance(first, RowNumbers):
+            return all_rows(first)[int(self._rows[0][0])]
+        if isinstance(first, Tensor | float):
+            return first
+        key = (id(first),)
+        if key not in self._made:
+            self._kept.append(values)
+            self._made[key] = self._new(values, type(first), name, key)
+        return self._made[key]
+
+
+def row_of(value: Some, row: int) -> Some:
+    """Return a copy of an object with the numbers of one row alone."""
+    found: Some = _Alone([torch.tensor([row], dtype=torch.int64, device="cpu")]).of([value], "")
+    return found
 
 
 def _equal(one: Any, other: Any) -> bool:

@@ -22,6 +22,7 @@ from ..lanes import scan
 from ..lanes.row_decisions import in_any_row, is_of_rows
 from .default_device import designed_on_cpu
 from .linalg import exponential
+from .quantiles import known_quantile
 
 TOLERANCE = 1e-6  # error of a hold or a step of a trajectory, relative to the state
 GRACE = 10.0  # times the tolerance: more steps are tried, and what is left above it is a warning
@@ -160,7 +161,7 @@ class StepCount(NamedTuple):
     """A number of steps and the relative error that is left with it."""
 
     number: int
-    error: float
+    error: float | Tensor  # a tensor () of a search
 
 
 def fewest_steps(errors: Callable[[int], Tensor], tolerance: float, most: int) -> StepCount:
@@ -175,24 +176,27 @@ def fewest_steps(errors: Callable[[int], Tensor], tolerance: float, most: int) -
         tolerance: of them.
         most: steps.
     """
-    count, last, served = 1, math.inf, 0
+    count, served = 1, 0
+    last: float | Tensor = math.inf
     while True:
         each = errors(count)
-        error = float(each.max()) if len(each) else 0.0
-        served += bool(len(each)) and bool(each.quantile(_MOSTLY, interpolation="lower") <= tolerance)
-        if error <= tolerance:
-            if math.isfinite(last):  # perhaps fewer: the error falls with the fourth power of the steps
-                count = max(count // 2 + 1, math.ceil(count * (error / tolerance) ** 0.25))
+        error = each.max() if len(each) else each.new_zeros(())
+        served += bool(len(each)) and bool(known_quantile(each, _MOSTLY, lower=True) <= tolerance)
+        if bool(error <= tolerance):
+            if bool(last < math.inf):  # perhaps fewer: the error falls with the fourth power of the steps
+                least, count = count * (error / tolerance) ** 0.25, count // 2 + 1
+                while bool(least > count):  # rows with numbers of their own part here
+                    count += 1
             return StepCount(count, error)
-        jumps = served > _DOUBLINGS and error <= _BOUNDED and error * _NEAR > last
+        jumps = served > _DOUBLINGS and bool(error <= _BOUNDED) and bool(error * _NEAR > last)
         if jumps or stalls(error, last) or 2 * count > most:
             return StepCount(count, error)
         count, last = 2 * count, error
 
 
-def stalls(error: float, last: float) -> bool:
+def stalls(error: float | Tensor, last: float | Tensor) -> bool:
     """Return whether twice the steps were of no use, because of rounding or corners of the rate."""
-    return error <= _SMALL and error * _NEAR > last
+    return bool(error <= _SMALL) and bool(error * _NEAR > last)
 
 
 class StepsNeeded(NamedTuple):

@@ -14,6 +14,7 @@ from ...lanes.contents import is_users, version
 from ...lanes.gradients import gradients_of, marked
 from ...lanes.one_thread import small
 from ...lanes.row_numbers import over_rows
+from ...lanes.loops import where_rows
 from ...lanes.row_objects import OfRows
 from ...numerics.checks import real, trailing
 from ...numerics.default_device import beside
@@ -167,6 +168,41 @@ def _tensors_of(policy: Any) -> dict[str, tuple[Tensor, int]]:
     """The tensors that an object holds itself, and how often each was written to."""
     held = {**getattr(policy, "__dict__", {}), **getattr(policy, "_buffers", {})}
     return {name: (x, version(x)) for name, x in held.items() if isinstance(x, Tensor)}
+
+
+class ControllerOfKinds(Controller):
+    """Controllers of rows with numbers of their own that are of several kinds: every row has its kind's.
+
+    Args:
+        kinds: of the same sizes.
+        kind: which of them a row has.
+    """
+
+    def __init__(self, kinds: Sequence[Controller], kind: Tensor) -> None:
+        super().__init__()
+        self.kinds, self.kind = nn.ModuleList(kinds), kind
+        self.draws, self.period = max(each.draws for each in kinds), kinds[0].period
+        self.work = max(each.work for each in kinds)
+
+    @property
+    def label(self) -> str:
+        return str(self.kinds[0].label)
+
+    def init(self, x0: Tensor) -> Carried:
+        return tuple(each.init(x0) for each in self.kinds)
+
+    def step(self, x: Tensor, carried: Carried, uniform: Tensor, dt: float) -> tuple[Tensor, Carried]:
+        u, after = self.kinds[0].step(x, carried[0], uniform, dt)
+        ends = [after]
+        for k, each in enumerate([*self.kinds][1:], 1):
+            given = x, carried[k], uniform
+
+            def own(now: Any, each: Controller = each) -> tuple[Tensor, Carried]:
+                return each.step(*now, dt)
+
+            u, after = where_rows((self.kind == k).expand(len(x)), own, given, (u, carried[k]))
+            ends.append(after)
+        return u, tuple(ends)
 
 
 class LQR(nn.Module, metaclass=OfRows):

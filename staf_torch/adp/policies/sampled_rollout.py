@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -13,6 +13,8 @@ from torch import Tensor
 
 from ...approximation.basis import StaFBasis
 from ...lanes import compiled, each, repeat, scan
+from ...lanes.loops import repeat_counted
+from ...lanes.row_objects import Rowwise
 from ...lanes.gradients import defer_gradient, marked
 from ...numerics.box import LARGEST, box_minimum
 from ...numerics.checks import fail, integer, positive_real, trailing
@@ -52,7 +54,7 @@ class Along(NamedTuple):
     middle: int | None  # the center at z = 0
 
 
-class SampledRollout(KeptPrecision):
+class SampledRollout(KeptPrecision, metaclass=Rowwise):
     """u(x) = the best of u_b and u_b + s d, s in {1, 0.3}, by what a simulation of each costs:
 
         Q(x, u) = cost of holding u for one period + sum of the base's costs over the horizon + V_T,
@@ -89,6 +91,8 @@ class SampledRollout(KeptPrecision):
     rollout that keeps the base's control among its choices does not cost more than the base.
     """
 
+    rowwise: ClassVar = {"control": (1,), "value": (1,), "rollout": (1,), "proposal": (1, 1)}
+
     @beside
     def __init__(
         self,
@@ -116,6 +120,7 @@ class SampledRollout(KeptPrecision):
         self.basis, self.plant, self.cost, self.base, self.terminal = basis, plant, cost, base, terminal
         self.period = positive_real("SampledRollout", "period", period)
         self.steps = integer("SampledRollout", "steps", steps, least=4)
+        self.counted = False  # True where rows have horizons of their own: ``quarter`` periods, four times
         self.holding = Holding("SampledRollout", plant, cost, self.period, substeps).checked()
         self.register_buffer("metric", metric.double())
         self.metric: Tensor
@@ -213,6 +218,13 @@ class SampledRollout(KeptPrecision):
             at, spent, share = repeat(passes, step, now)
             return (at, spent, share), spent + share * self.terminal(at)
 
+        if self.counted:
+            quarter = self.get_buffer("quarter")
+
+            def stretch(now: RolloutStretch, _: Tensor) -> tuple[RolloutStretch, Tensor]:
+                at, spent, share = repeat_counted(passes, quarter, step, now)
+                return (at, spent, share), spent + share * self.terminal(at)
+
         def whole(x: Tensor) -> Tensor:
             none = torch.zeros_like(x[..., 0])
             (at, _, _), promised = scan(stretch, (x, none, none + 1.0), stretches, dim=0)
@@ -237,7 +249,11 @@ class SampledRollout(KeptPrecision):
             after, _ = self.holding(at, u)
             return after, torch.where(((u <= low) | (u >= high)).any(-1), 1.0, met)
 
-        met: Tensor = repeat(self.steps, step, (x, torch.zeros_like(x[..., 0])))[1]
+        start = x, torch.zeros_like(x[..., 0])
+        if self.counted:
+            met: Tensor = repeat_counted(self.steps, 4 * self.get_buffer("quarter"), step, start)[1]
+        else:
+            met = repeat(self.steps, step, start)[1]
         return met.unsqueeze(-1)
 
     def _promised(self, x: Tensor, first: int) -> Promise:
@@ -263,8 +279,9 @@ class SampledRollout(KeptPrecision):
         after, paid = self.holding(x, self.control(x))
         return paid + self._discount() * self.rollout(after).whole
 
-    def _discount(self) -> float:
-        return math.exp(-self.cost.discount * self.period)
+    def _discount(self) -> float | Tensor:
+        rate = self.cost.discount  # a tensor where rows have their own
+        return torch.exp(-rate * self.period) if isinstance(rate, Tensor) else math.exp(-rate * self.period)
 
 
 def _along(basis: StaFBasis) -> Along:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ...lanes import repeat, scan
 from ...lanes.loops import untraced
+from ...lanes.row_decisions import is_of_rows
 from ...lanes.row_numbers import each_row, met_rows, nonzero
 from ...lanes.row_objects import made_by_rows
 from ...numerics.checks import integer, positive_real
@@ -27,6 +28,7 @@ from ...numerics.exponential_step import (
     exponential_step,
     fewest_steps,
 )
+from ...numerics.quantiles import known_quantile
 from ...numerics.runge_kutta import exponential, stage_weights
 from ...systems import Clocked, Plant, StepPlant
 from .cost import Cost, quadratic
@@ -110,7 +112,7 @@ class Holding:
         self.table: ExponentialStep | None = None
         self.curvature: Tensor | None = None  # of the cost, with a table
         self.discount = 0.0 if cost is None else cost.discount
-        self.error: float | None = None
+        self.error: float | Tensor | None = None
         if plant.period is not None:
             self.least = self.steps = periods(call, plant, dt)
         elif substeps is None:
@@ -295,12 +297,11 @@ class Holding:
             return lambda count: self._with(count, linear).errors(x, u)
 
         one, linear = errors(None)(1), self._linearisation()
-        found = StepCount(1, float(one.max()) if len(one) else 0.0)
-        usual = float(one.quantile(_SHARE, interpolation="lower")) if len(one) else 0.0
-        slow = linear is None or float(torch.linalg.eigvals(linear).abs().max()) * self.dt <= RESOLVED
-        if not slow or usual > GRACE * TOLERANCE or found.error > _OUTSIDE * TOLERANCE:
-            stays = self._stays(x, u)
-            x, u = x[stays], u[stays]
+        found = StepCount(1, one.max() if len(one) else 0.0)
+        usual = known_quantile(one, _SHARE, lower=True) if len(one) else 0.0
+        slow = linear is None or bool(torch.linalg.eigvals(linear).abs().max() * self.dt <= RESOLVED)
+        if not slow or bool(usual > GRACE * TOLERANCE) or bool(found.error > _OUTSIDE * TOLERANCE):
+            x, u = _those(self._stays(x, u), x, u)
             if not (exponential and _adds(self.plant)):
                 linear = None
             elif self.cost is not None:
@@ -308,13 +309,14 @@ class Holding:
             dear = StepCount(MOST, math.inf)
             if linear is not None:
                 dear = fewest_steps(errors(linear), TOLERANCE, MOST)
-            most = MOST if dear.error > TOLERANCE else min(MOST, math.ceil(_DEARER * dear.number))
+            most = MOST if bool(dear.error > TOLERANCE) else min(MOST, math.ceil(_DEARER * dear.number))
             found = fewest_steps(errors(None), TOLERANCE, most)
-            cheaper = found.error <= TOLERANCE and found.number <= _DEARER * dear.number
-            if not cheaper and dear.error < found.error:
+            cheaper = bool(found.error <= TOLERANCE) and found.number <= _DEARER * dear.number
+            if not cheaper and bool(dear.error < found.error):
                 found, self.table = dear, self._with(dear.number, linear).table
-        self.least, self.steps, self.error = found.number, found.number, found.error
-        if not found.error <= (_OUTSIDE if found.number == 1 and self.table is None else GRACE) * TOLERANCE:
+        self.least = self.steps = found.number
+        self.error = found.error if is_of_rows(found.error) else float(found.error)
+        if not bool(found.error <= (_OUTSIDE if found.number == 1 and self.table is None else GRACE) * TOLERANCE):
             _log.warning(
                 "%s: with %d integration steps a period of %.4g s the next state is wrong by %.2g of its "
                 "size (wanted: %.0e): the rate is too fast for this dt, or has corners.",
@@ -328,8 +330,8 @@ class Holding:
         for count in (_SOME, MOST):
             asked = stays.clone() if count == _SOME else ~stays
             if bool(asked.any()):
-                after = self._with(count, None)(x[asked], u[asked])[0]
-                stays[asked] = torch.isfinite(after).all(-1)
+                after = torch.isfinite(self._with(count, None)(*_those(asked, x, u))[0]).all(-1)
+                stays = after if count == _SOME else stays.masked_scatter(asked, after)
         return stays
 
     def _with(self, count: int, linear: Tensor | None) -> Holding:
@@ -353,7 +355,7 @@ class Holding:
         (after, paid), (better, due) = self(x, u), self.finer(2)(x, u)
         rest = self._rest().to(x)
         size = torch.stack([self.plant.difference(at, rest).abs().amax(-1) for at in (x, better)]).amax(0)
-        least = _LEAST * (1 + float(rest.abs().max()))
+        least = _LEAST * (1 + rest.abs().max())
         rate = due.abs() if self.cost is None else self.dt * self.cost.rate(x, u).abs() + due.abs()
         wrong = (after - better).abs().amax(-1)
         return (wrong, size.clamp(min=least)), ((paid - due).abs(), rate.clamp(min=least**2))
@@ -393,14 +395,19 @@ class Holding:
         for k in range(u.shape[-1]):  # as far as a loop may go in a period
             one = torch.eye(len(still), dtype=torch.float64, device=still.device)[k]
             pushed = plant.motion(x, u + one) - rate
-            push = float(pushed.abs().amax(-1).nan_to_num(0.0, 0.0).quantile(0.5))
-            width = _MOVED * plant.spread / (self.dt * push) if push > 0 else 1.0
-            least = max(float(low[k]), float(still[k]) - width)
-            most = min(float(high[k]), float(still[k]) + width)
+            push = known_quantile(pushed.abs().amax(-1).nan_to_num(0.0, 0.0), 0.5)
+            width = torch.where(push > 0, _MOVED * plant.spread / (self.dt * push), 1.0)
+            least = torch.maximum(low[k], still[k] - width)
+            most = torch.minimum(high[k], still[k] + width)
             columns.append(least + (most - least) * chance[:, k])
         u = torch.stack(columns, dim=-1) if columns else u
         moves = torch.isfinite(plant.motion(x, u)).all(-1)
-        return x[moves], u[moves]
+        return _those(moves, x, u)
+
+
+def _those(keep: Tensor, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the samples (P, ...) to keep, (P,) bool."""
+    return (x, u) if bool(keep.all()) else (x[keep], u[keep])
 
 
 def _adds(plant: Plant) -> bool:

@@ -13,7 +13,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from ...lanes.row_decisions import numbers_of_rows
+from ...lanes.row_decisions import numbers_of_rows, of_first
 from ...numerics.checks import fail, positive_real
 from ...systems import Bounds, Clocked, Plant
 from ...systems.equilibria import check_rest
@@ -203,22 +203,23 @@ def _check_held(call: str, plant: Plant, placed: Cost, argument: str) -> bool:
     return check_within(call, argument, placed.bounds, u)
 
 
-def slowest(policy: Callable[[Tensor], Tensor], plant: Plant, cost: Cost, period: float) -> float:
-    """Return the decay of the slowest mode of a held, linearised loop, 1/s."""
-    radius = HeldLoop.of(policy, plant, at=cost.target).spectral_radius(period)
-    return -math.log(max(min(radius, 1 - 1e-9), 1e-9)) / period
+def slowest(policy: Callable[[Tensor], Tensor], plant: Plant, cost: Cost, period: float) -> Tensor:
+    """Return the decay of the slowest mode of a held, linearised loop, 1/s, ()."""
+    radius = HeldLoop.of(policy, plant, at=cost.target).radius(period)
+    return -radius.clamp(1e-9, 1 - 1e-9).log() / period
 
 
-def warn_if_short(call: str, argument: str, horizon: float, decay: float) -> None:
+def warn_if_short(call: str, argument: str, horizon: float, decay: Tensor) -> None:
     """Say in the log that a horizon ends before the loop has decayed once.
 
     Args:
         call: the door.
         argument: that states the horizon.
         horizon: s.
-        decay: of the slowest mode, 1/s.
+        decay: of the slowest mode, 1/s, ().
     """
-    if horizon * decay < _CONSTANTS:
+    if bool(horizon * decay < _CONSTANTS):
+        decay = of_first(decay)
         _log.warning(
             "`%s(%s=...)`: the horizon of %.3g s is %.2g time constants of the slowest mode of the regulated "
             "plant: what lies beyond is left to the linear regulator's value. Take %.3g s.",

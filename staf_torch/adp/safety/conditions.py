@@ -9,6 +9,7 @@ Where bounds limit h'' the speed must stay one that they can stop, v^2 <= 2 a h.
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -17,6 +18,7 @@ from torch import Tensor, nn
 
 from ...numerics.checks import fail, non_negative, one_or_each, positive, trailing
 from ...numerics.default_device import device_of
+from ...numerics.quantiles import known_quantile
 from ...numerics.row_checks import check_rows
 from ...numerics.runge_kutta import runge_kutta_step
 from ...systems import Bounds, Plant, StepPlant
@@ -93,8 +95,8 @@ class Conditions(nn.Module):
         self.margin: Tensor  # (k,)
         self.decay: Tensor  # (k,) 1/s
         if decay is not None:
-            rates = one_or_each("SafetyFilter", "decay", decay, count)
-            self.decay.copy_(positive("SafetyFilter", "decay", rates))
+            rates = positive("SafetyFilter", "decay", one_or_each("SafetyFilter", "decay", decay, count))
+            self.register_buffer("decay", rates.to(self.decay))
         for name, end in (("low", bounds.low), ("high", bounds.high)):
             self.register_buffer(name, _reachable(end, bounds, plant.resting_input()))
         self.low: Tensor  # (m,) as far as brakes may reach
@@ -104,12 +106,13 @@ class Conditions(nn.Module):
         self.moving = bool((values != values[:1]).any())
         self.degree = self._degrees(degree, x, t)
         found = _brakes(self, x, t)
-        self.brakes: tuple[float | None, ...] = found.constant
-        self.usual: tuple[float | None, ...] = found.usual
-        self.weak: tuple[bool, ...] = found.weak
-        self.apart: bool = found.apart
+        self.braked, self.limited, self.weak, self.apart = found.braked, found.limited, found.weak, found.apart
+        self.register_buffer("brakes", found.constant)
+        self.register_buffer("usual", found.usual)
+        self.brakes: Tensor  # (k,)
+        self.usual: Tensor  # (k,)
         if decay is None:
-            self.decay.copy_(self.decay.new_tensor(found.decay))
+            self.register_buffer("decay", found.decay.to(self.decay))
         second = torch.tensor(self.degree, dtype=torch.int64, device=self.decay.device) == 2
         if bool((second & (self.decay * self.hold > 1)).any()):
             rule = f"must be at most 1/dt = {1 / self.hold:g} where the relative degree is two"
@@ -140,9 +143,9 @@ class Conditions(nn.Module):
         missing = self._required(k, ends, end, middle) - end
         if self.degree[k] == 2:
             missing = torch.maximum(missing, -self._stop(k, ends))
-        strain, usual = torch.zeros_like(missing) - 1, self.usual[k]
-        if self.brakes[k] is None and usual is not None and self.degree[k] == 2:
-            room = (2 * _CAREFUL * usual * ends.last_value).square() * ends.last_slope
+        strain = torch.zeros_like(missing) - 1
+        if not self.braked[k] and self.limited[k] and self.degree[k] == 2:
+            room = (2 * _CAREFUL * self.usual[k] * ends.last_value).square() * ends.last_slope
             near = (ends.last_rate < 0) & (ends.last_value > 0)
             strain = torch.where(near, ends.last_rate.square().square() - room, strain)
         return missing, number(self.constraints[k])(x, t), strain
@@ -250,9 +253,9 @@ class Conditions(nn.Module):
         asked = 0.5 * self.hold * speed.square() / torch.where(speed > 0, room, 1.0) - speed
         asked = torch.where(value > 0, asked, 0.0)
         fast = (rate < 0) & (rate + self.decay[k].to(rate) * value < 0)
-        free, brakes = torch.ones_like(rate), self.brakes[k]
-        if brakes is not None:
-            most = (1 - _RESERVE) * brakes
+        free = torch.ones_like(rate)
+        if self.braked[k]:
+            most = (1 - _RESERVE) * self.brakes[k].to(rate)
             left = 2 * most * last_value - _speed(last_rate).square()
             free = torch.where(value > 0, left / (most * self.hold + rate.abs()), free)
         return torch.where(fast, last_rate - asked, free)
@@ -303,46 +306,52 @@ class Conditions(nn.Module):
 class _Brakes(NamedTuple):
     """The authority of the inputs over every constraint, found at states around the equilibrium."""
 
-    constant: tuple[float | None, ...]  # the largest h'' where it is the same everywhere, positive and finite
-    usual: tuple[float | None, ...]  # what the inputs can add a unit of the gradient; None without bounds
+    braked: tuple[bool, ...]  # whether the largest h'' is the same everywhere, positive and finite
+    constant: Tensor  # (k,) it; inf where it is not
+    limited: tuple[bool, ...]  # whether bounds limit what the inputs can do
+    usual: Tensor  # (k,) what they can add a unit of the gradient; inf where nothing limits it
     weak: tuple[bool, ...]  # whether there are edges, h = h' = 0, at which they cannot hold it
     apart: bool  # whether all are constant, and braking for one never drives another
-    decay: tuple[float, ...]  # by default
+    decay: Tensor  # (k,) by default
 
 
 def _reachable(end: Tensor, bounds: Bounds, rest: Tensor) -> Tensor:
     """Bounds in which inputs without one of their own may go far beside the others that have one."""
     bounds = bounds.on(rest.device)
     end, both = end.to(rest.device), torch.cat((bounds.low - rest, bounds.high - rest)).double()
-    known = both[torch.isfinite(both)].abs()
-    if not len(known):
+    finite = torch.isfinite(both)
+    if not bool(finite.any()):
         return end.clone()
-    far = _FAR * float(known.max())
+    known = torch.where(finite, both, 0.0).abs()
+    far = _FAR * known.max()
     return torch.where(torch.isfinite(end), end, rest.to(end) + torch.sign(end) * far)
 
 
 @torch.no_grad()
 def _brakes(of: Conditions, x: Tensor, t: Tensor) -> _Brakes:
     lean, slopes = Lean(*of.every(of.lean, x, t)), of.every(of.level, x, t)[2].sqrt()
-    count, fastest = len(of.constraints), 1 / (_PERIODS * of.hold)
+    count, fastest = len(of.constraints), x.new_tensor(1 / (_PERIODS * of.hold))
     rest, slope, bounds = of.plant.resting_input().to(x), lean.slope, of.bounds.on(x.device)
     own = torch.where(slope > 0, slope * (bounds.high - rest), slope * (bounds.low - rest))
     sure = torch.where(torch.isfinite(own), own, 0.0).sum(-1)  # of the inputs that have bounds
-    constant: list[float | None] = []
-    usual: list[float | None] = []
-    weak, decays = [], []
+    none, braked, limited, weak = x.new_tensor(math.inf), [], [], []
+    constant, usual, decays = [], [], []
     for k in range(count):
-        value, reach = lean.value[:, k], sure[:, k]
+        value, reach, ability = lean.value[:, k], sure[:, k], lean.ability[:, k]
         inside = (value > 0) & (reach > _NOTHING)
-        limited = bool(inside.any()) and bool(torch.isfinite(lean.ability[:, k]).all())
-        usual.append(float((reach / slopes[:, k])[inside].quantile(_RARE)) if limited else None)
-        same = limited and of.degree[k] == 2 and _same(lean.ability[:, k]) and _same(lean.slope[:, k])
-        good = same and float(lean.ability[0, k]) > _NOTHING
-        constant.append(float(lean.ability[0, k]) if good else None)
-        weak.append(limited and not good and _is_weak(of, k, x, t, float(reach[inside].median())))
-        slowest = _decay(value, reach, inside) if limited and of.degree[k] == 2 else fastest
-        decays.append(min(slowest, fastest))
-    alone = all(a is not None or of.degree[k] == 1 or usual[k] is None for k, a in enumerate(constant))
+        within = bool(inside.any()) and bool(torch.isfinite(ability).all())
+        ratio = torch.where(inside, reach / slopes[:, k], torch.nan)
+        usual.append(known_quantile(ratio, _RARE) if within else none)
+        same = within and of.degree[k] == 2 and _same(ability) and _same(lean.slope[:, k])
+        good = same and bool(ability[0] > _NOTHING)
+        constant.append(ability[0] if good else none)
+        middle = torch.where(inside, reach, torch.nan).nanmedian()
+        weak.append(within and not good and _is_weak(of, k, x, t, middle))
+        slowest = _decay(value, reach, inside) if within and of.degree[k] == 2 else fastest
+        decays.append(torch.minimum(slowest, fastest))
+        braked.append(good)
+        limited.append(within)
+    alone = all(braked[k] or of.degree[k] == 1 or not limited[k] for k in range(count))
     apart = (
         alone
         and not any(weak)
@@ -350,14 +359,16 @@ def _brakes(of: Conditions, x: Tensor, t: Tensor) -> _Brakes:
             _apart(lean, i, j) for i in range(count) for j in range(i) if of.degree[i] == of.degree[j] == 2
         )
     )
-    return _Brakes(tuple(constant), tuple(usual), tuple(weak), apart, tuple(decays))
+    numbers = map(torch.stack, (constant, usual, decays))
+    most, often, rates = (each.detach() for each in numbers)
+    return _Brakes(tuple(braked), most, tuple(limited), often, tuple(weak), apart, rates)
 
 
-def _decay(value: Tensor, reach: Tensor, inside: Tensor) -> float:
+def _decay(value: Tensor, reach: Tensor, inside: Tensor) -> Tensor:
     """Return the decay at which the brakes just stop what is admitted at a usual distance, sqrt(2 reach / h),
     at the time at which it is fastest. A rate that the inputs move themselves is stopped at once."""
     share = torch.where(inside, reach / value, torch.nan).reshape(len(TIMES), -1)
-    return float((2 * torch.nanmedian(share, dim=1).values.nan_to_num(0.0).max()).sqrt())
+    return (2 * torch.nanmedian(share, dim=1).values.nan_to_num(0.0).max()).sqrt()
 
 
 def _same(values: Tensor) -> bool:
@@ -371,7 +382,7 @@ def _apart(lean: Lean, i: int, j: int) -> bool:
     return not opposed or _same(lean.value[:, i] + lean.value[:, j])
 
 
-def _is_weak(of: Conditions, k: int, x: Tensor, t: Tensor, usual: float) -> bool:
+def _is_weak(of: Conditions, k: int, x: Tensor, t: Tensor, usual: Tensor) -> bool:
     """Return whether the bounds cannot hold h at several states of its edge, where h (and h') are 0."""
 
     def off(x: Tensor, t: Tensor) -> Tensor:
@@ -386,8 +397,9 @@ def _is_weak(of: Conditions, k: int, x: Tensor, t: Tensor, usual: float) -> bool
     near = (torch.func.vmap(off)(edge, t).abs() < 1e-6).all(-1) & torch.isfinite(edge).all(-1)
     if not bool(near.any()):
         return False
-    (*_, ability) = torch.func.vmap(functools.partial(of.lean, k))(edge[near].unsqueeze(1), t[near])
-    return float((ability < 1e-3 * usual * (of.degree[k] == 2)).double().mean()) > _SEVERAL
+    (*_, ability) = torch.func.vmap(functools.partial(of.lean, k))(edge.unsqueeze(1), t)
+    short = near & (ability < 1e-3 * usual * (of.degree[k] == 2))
+    return bool(short.double().sum() / near.double().sum() > _SEVERAL)
 
 
 def _speed(rate: Tensor) -> Tensor:

@@ -18,11 +18,13 @@ import torch
 from torch import Tensor, nn
 
 from ...lanes import repeat, where_rows
+from ...lanes.loops import repeat_counted
+from ...lanes.row_decisions import in_any_row, is_of_rows
 from ..loop.controller import Policy
 from .conditions import Conditions, Ends, Lean
 
 _BRAKING, _SHARE = 48, 8.0  # steps of the hardest brake; each at least a period and 1/8 of what is left
-_FOLLOWED, _CONSTANTS = 300, 4.0  # periods of the policy at most; time constants of its slowest mode
+_FEWEST, _FOLLOWED, _CONSTANTS = 20, 300, 4.0  # periods of the policy; time constants of its slowest mode
 _SPARE = 0.01  # of the brakes, that a control must leave which is not the hardest
 _URGENT = 0.5  # share of the brakes at a state, from which on they are followed
 _BACK = 0.5  # of x'Px, to which the policy must have brought the state
@@ -35,7 +37,7 @@ class Opposed(NamedTuple):
     """The rest of the plant under braking along an edge, linearised at the equilibrium."""
 
     rate: Tensor  # (k,) 1/s, of the fastest growth; at most 0 where nothing runs away
-    alone: float | None  # 1/s, of the slowest mode under the policy alone; None where it is not known
+    alone: Tensor | None  # () 1/s, of the slowest mode under the policy alone; None where it is not known
     bowl: Tensor | None  # P of x'Px, which falls under the policy
 
 
@@ -49,10 +51,15 @@ class Chosen(NamedTuple):
 class LookAhead(nn.Module):
     """Choose between controls by what follows them.
 
+    Attributes:
+        periods: for which the policy is followed at most; a row with numbers of its own has its ``count``.
+
     Args:
         conditions: of the filter.
         policy: u from x; None for one that remembers, which is not followed.
     """
+
+    largest = ("periods",)
 
     def __init__(self, conditions: Conditions, policy: Policy | None) -> None:
         super().__init__()
@@ -61,19 +68,26 @@ class LookAhead(nn.Module):
         self.against = found.rate
         self.opposed = bool((found.rate > 0).any())
         self.weak = any(conditions.weak)
-        bounded = any(usual is not None for usual in conditions.usual)
-        self.acts = bounded or self.opposed
+        self.acts = any(conditions.limited) or self.opposed
         self.by_policy = policy is not None and (self.weak or (self.opposed and found.alone is not None))
         self.by_brakes = not (self.opposed and self.by_policy)
         if self.opposed and not self.by_policy:
             self.acts = False  # nothing tells what becomes of a state
-        slow = max(-(found.alone or 0.0), 1e-9)
-        periods = min(_CONSTANTS / slow / conditions.hold, float(_FOLLOWED))
-        self.periods = max(math.ceil(periods), 20)
-        single = conditions.holding.classical
-        self.longest = (
-            max(conditions.hold, 0.5 / max(_fastest(conditions), 1e-9)) if single else conditions.hold
-        )
+        self.periods, self.counted, count = _FEWEST, False, conditions.decay.new_tensor(float(_FEWEST))
+        if self.by_policy:
+            slow = (-(torch.zeros_like(count) if found.alone is None else found.alone)).clamp(min=1e-9)
+            periods = (_CONSTANTS / slow / conditions.hold).ceil().clamp(max=_FOLLOWED)
+            count = torch.maximum(count, periods)
+            self.counted = is_of_rows(count)
+            while in_any_row(count > self.periods):
+                self.periods += 1
+        self.register_buffer("count", count)
+        self.count: Tensor  # () periods that are followed
+        hold = conditions.decay.new_tensor(conditions.hold)
+        if conditions.holding.classical:
+            hold = torch.maximum(hold, 0.5 / _fastest(conditions).clamp(min=1e-9))
+        self.register_buffer("longest", hold)
+        self.longest: Tensor  # ()
         self.register_buffer("bowl", found.bowl if self.opposed and self.by_policy else None)
         self.bowl: Tensor | None
 
@@ -167,8 +181,7 @@ class LookAhead(nn.Module):
 
     def _stopped(self, ends: Ends) -> Tensor:
         """h - margin where constant brakes have stopped: (B, k)."""
-        brakes = [math.inf if a is None else a for a in self.conditions.brakes]
-        most = torch.tensor(brakes, dtype=ends.value.dtype, device=ends.value.device)
+        most = self.conditions.brakes.to(ends.value)
         speed = torch.where(ends.last_rate < 0, -ends.last_rate, 0.0)
         return ends.last_value - 0.5 * speed.square() / most
 
@@ -179,7 +192,7 @@ class LookAhead(nn.Module):
         weak = torch.tensor(of.weak, dtype=torch.bool, device=x.device)
         value, rate, _ = of.every(of.level, x, t)
         start = x, t, value, rate, value, value, strength, t == t
-        rest = of.plant.resting_input().to(x)
+        rest, longest = of.plant.resting_input().to(x), self.longest.to(x)
 
         def brake(now: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
             x, t, value, rate, _, least, strength, _ = now
@@ -187,7 +200,7 @@ class LookAhead(nn.Module):
             able = torch.where(lean.ability > 0, lean.ability, 1.0)
             left = torch.where(second & (lean.ability > 0), _speed(lean) / able, 0.0).amax(-1) / _SHARE
             length = torch.where(
-                left > of.hold, torch.where(left < self.longest, left, self.longest), of.hold
+                left > of.hold, torch.where(left < longest, left, longest), of.hold
             )
             u = rest + strength * (self.hardest(lean) - rest)
             x, t, ends = self._moved(x, u, t, value, rate, length)
@@ -218,7 +231,10 @@ class LookAhead(nn.Module):
             return x, t, ends.last_value, ends.last_rate, least, spent
 
         start = x, t, value, rate, value, torch.zeros_like(t)
-        last, _, _, _, least, spent = repeat(self.periods, follow, start)
+        if self.counted:  # rows have periods of their own
+            last, _, _, _, least, spent = repeat_counted(self.periods, self.count, follow, start)
+        else:
+            last, _, _, _, least, spent = repeat(self.periods, follow, start)
         back = torch.isfinite(last).all(-1)
         if self.bowl is not None:
             back = back & (self._height(last) <= _BACK * self._height(x) + _ROUNDED)
@@ -267,48 +283,51 @@ def opposition(of: Conditions, policy: Policy | None) -> Opposed:
     closed = a - b @ gain
     if not bool(torch.isfinite(closed).all()):
         return none
-    alone = float(torch.linalg.eigvals(closed).real.max()) if policy is not None else None
-    fast = float(torch.linalg.eigvals(closed).abs().max())
-    if alone is not None and alone > _UNSTABLE * fast:
+    modes = torch.linalg.eigvals(closed)
+    alone, fast = None if policy is None else modes.real.max(), modes.abs().max()
+    if alone is not None and bool(alone > _UNSTABLE * fast):
         return none  # the policy brings nothing back by itself
-    rates = torch.zeros_like(of.decay)
+    rates = list[Tensor]()
     x, _ = of._around()
     normals = [torch.func.vmap(torch.func.grad(lambda x, h=h: h(x.unsqueeze(0), x.new_zeros(()))[0]))
                for h in of.constraints]  # fmt: skip
     for k, normal in enumerate(normals):
-        grown = [_growth(c, a, b, closed, float(of.decay[k]), of.degree[k]) for c in normal(x[:8])]
-        known = sorted(rate for rate in grown if rate is not None)
-        if known and (middle := known[len(known) // 2]) > 0:
-            rates[k] = middle
+        grown = torch.stack([_growth(c, a, b, closed, of.decay[k], of.degree[k]) for c in normal(x[:8])])
+        known = grown == grown
+        middle = grown.sort().values.gather(0, known.sum().unsqueeze(0) // 2 % len(grown))[0]
+        rates.append(torch.where(known.any() & (middle > 0), middle, 0.0))
+    rate = torch.stack(rates)
     bowl = None
-    if alone is not None and alone < 0 and bool((rates > 0).any()):
+    if alone is not None and bool((rate > 0).any()) and bool(alone < 0):
         eye, turned = (
             torch.eye(len(a), dtype=a.dtype, device=a.device),
             closed.mT.contiguous(),
         )  # A'P + PA = -1
         bowl = torch.linalg.solve(torch.kron(eye, turned) + torch.kron(turned, eye), -eye.flatten())
         bowl = bowl.unflatten(0, eye.shape)
-    return Opposed(rates, alone, bowl)
+    return Opposed(rate, alone, bowl)
 
 
-def _growth(c: Tensor, a: Tensor, b: Tensor, closed: Tensor, decay: float, degree: int) -> float | None:
-    """Return the growth of the fastest mode along an edge of normal c, 0 for none; None without an effect."""
+def _growth(c: Tensor, a: Tensor, b: Tensor, closed: Tensor, decay: Tensor, degree: int) -> Tensor:
+    """Return the growth of the fastest mode along an edge of normal c, 0 for none; NaN without an effect."""
     phi, push = (c, c @ b) if degree == 1 else (c @ a + decay * c, c @ a @ b)
-    size = float(push.square().sum())
-    if not size > 1e-12 * float((c.square().sum() * b.square().sum()).clamp(min=1e-300)):
-        return None
+    size = push.square().sum()
+    effect = size > 1e-12 * (c.square().sum() * b.square().sum()).clamp(min=1e-300)
     eye = torch.eye(len(a), dtype=a.dtype, device=a.device)
-    along = closed - torch.outer(b @ push, phi @ (closed + decay * eye)) / size
-    modes = torch.linalg.eigvals(along)
-    growth, before = float(modes.real.max()), float(torch.linalg.eigvals(closed).real.max())
-    return growth if growth > max(_UNSTABLE * float(modes.abs().max()), before) else 0.0
+    along = closed - torch.outer(b @ push, phi @ (closed + decay * eye)) / torch.where(effect, size, 1.0)
+    known = effect & torch.isfinite(along).all()
+    modes = torch.linalg.eigvals(torch.where(known, along, 0.0))
+    growth, before = modes.real.max(), torch.linalg.eigvals(closed).real.max()
+    grows = growth > torch.maximum(_UNSTABLE * modes.abs().max(), before)
+    return torch.where(known, torch.where(grows, growth, 0.0), torch.nan)
 
 
-def _fastest(of: Conditions) -> float:
+def _fastest(of: Conditions) -> Tensor:
     """Return the fastest rate of the plant at its equilibrium, 1/s: below it lie steps of the brakes."""
     at, rest = of.plant.equilibrium().double(), of.plant.resting_input().double()
     a = torch.func.jacrev(of.plant.motion)(at, rest).detach()
-    return float(torch.linalg.matrix_norm(a)) if bool(torch.isfinite(a).all()) else math.inf
+    finite = torch.isfinite(a).all()
+    return torch.where(finite, torch.linalg.matrix_norm(torch.where(finite, a, 0.0)), torch.inf)
 
 
 def _speed(lean: Lean) -> Tensor:

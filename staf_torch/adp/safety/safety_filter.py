@@ -8,11 +8,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ...lanes import compiled, repeat, where_rows
 from ...lanes.gradients import gradients_of, marked
 from ...lanes.one_thread import small
+from ...lanes.row_decisions import of_first
+from ...lanes.row_objects import Kind, of_kinds, whichever
 from ...numerics.checks import fail, one_or_each, positive, positive_real, trailing
 from ...numerics.default_device import beside, device_of
 from ...numerics.shown import limits, shown
@@ -187,15 +189,26 @@ class SafetyFilter(Controller):
         device = device_of(plant)
         self.register_buffer("unit", heavy.rsqrt().to(device))
         self.unit: Tensor  # (m,) of an input, in which distances are measured
-        low_, high_ = (end.to(self.unit) / self.unit for end in (self.bounds.low, self.bounds.high))
-        self.register_buffer("table", cases(count, low_.tolist(), high_.tolist()).to(device))
+        sides = (torch.where(torch.isfinite(end), 0.0, end) for end in (self.bounds.low, self.bounds.high))
+        self.register_buffer("table", cases(count, *(side.tolist() for side in sides)).to(device))
         self.table: Tensor
         self.ahead = LookAhead(self.conditions, self._policy)
         if self.ahead.acts:
             self.work = _FOLLOWING if self.ahead.by_policy else (1.0 if self.conditions.apart else _BRAKING)
-        for k, rate in enumerate(self.ahead.against.tolist()):
-            if rate > 0:
-                _log.warning(_OPPOSED, k, rate, _FOLLOWS if self.ahead.by_policy else _TOPPLES)
+        self.follows, self.opposed = self.ahead.by_policy, self.ahead.opposed
+        self.kinds = nn.ModuleList()
+        for k, rate in enumerate(self.ahead.against):
+            if bool(rate > 0):
+                _log.warning(_OPPOSED, k, float(of_first(rate)), _FOLLOWS if self.follows else _TOPPLES)
+
+    @classmethod
+    def of_kinds(cls, kinds: list[Kind]) -> SafetyFilter:
+        """Return the filter of rows that are of several kinds, as their constraints and brakes are."""
+        made: SafetyFilter = of_kinds(kinds)
+        for name in ("moving", "follows", "opposed"):
+            setattr(made, name, any(getattr(each, name) for each in made.kinds))
+        made.work = max(float(kind.object.work) for kind in kinds)
+        return made
 
     @property
     def decay(self) -> Tensor:
@@ -255,7 +268,7 @@ class SafetyFilter(Controller):
         if t is None and self.moving:
             raise fail("SafetyFilter", "t", "must be given: a constraint depends on the time", t)
         time = torch.as_tensor(0.0 if t is None else t, device=x.device).to(x).expand(x.shape[:-1])
-        if self.ahead.by_policy:
+        if self.follows:
             self._nearest.hasten()  # hundreds of periods are followed: seconds in plain torch
         try:
             z = torch.cat((x, u, time.unsqueeze(-1)), dim=-1)
@@ -264,7 +277,7 @@ class SafetyFilter(Controller):
             raise fail("SafetyFilter", "u", rule, tuple(u.shape[:-1])) from error
         found, k = self._nearest(z), len(self.constraints)
         control, margin, more = found.split((m := u.shape[-1], k, found.shape[-1] - m - k), dim=-1)
-        astray = more[..., 1] if self.ahead.opposed else torch.zeros_like(time)
+        astray = more[..., 1] if self.opposed else torch.zeros_like(time)
         return marked("SafetyFilter", self.layers, Filtered(control, margin, more[..., 0], astray))
 
     def init(self, x0: Tensor) -> Watched:
@@ -329,8 +342,12 @@ class SafetyFilter(Controller):
             return exact.to(z.dtype)
         n, m = self.plant.equilibrium().numel(), self.plant.inputs
         if not z.numel():
-            return z.new_zeros(*z.shape[:-1], m + len(self.constraints) + 1 + self.ahead.opposed)
+            return z.new_zeros(*z.shape[:-1], m + len(self.constraints) + 1 + self.opposed)
         flat = z.reshape(-1, z.shape[-1])
+        if len(self.kinds):
+            none = flat.new_zeros(len(flat), m + len(self.constraints) + 2)
+            found = whichever(self.get_buffer("kind"), [each.nearest for each in self.kinds], flat, none)
+            return found.reshape(*z.shape[:-1], -1)[..., : none.shape[-1] - 1 + self.opposed]
         x, wanted, t = flat[:, :n], flat[:, n : n + m], flat[:, n + m]
         low, high = self.bounds.low.to(x), self.bounds.high.to(x)
         unit, of = self.unit.to(x), self.conditions
@@ -360,6 +377,11 @@ class SafetyFilter(Controller):
         more = (slack, astray) if self.ahead.opposed else (slack,)
         found = torch.cat((u, margin, torch.stack(more, dim=-1)), dim=-1)
         return found.reshape(*z.shape[:-1], -1)
+
+    def nearest(self, z: Tensor) -> Tensor:
+        """`_nearest` in plain torch, of rows that are of this kind among others: (B, n + m + 1) -> (B, ...)."""
+        found: Tensor = self._nearest.definition(z)
+        return found if self.opposed else torch.cat((found, torch.zeros_like(found[:, :1])), dim=-1)
 
     def _linearised(
         self, x: Tensor, at: Tensor, first: Tensor, t: Tensor, asked: Tensor
