@@ -29,6 +29,7 @@ ROWS = 7
 X0 = torch.tensor([[-1.0, 1.0], [0.5, 0.5], [0.2, -0.7], [0.1, 0.3], [0.6, -0.2], [-0.4, 0.3], [0.9, 0.1]])
 STATES = torch.stack([X0 + 0.02 * k * X0.flip(1) for k in range(4)], dim=1)  # (B, T, n)
 TWO, COST, PENDULUM = systems.TwoState(), adp.QuadraticCost(1.0, 1.0, 2, 1), systems.Pendulum()
+LIMITED = adp.QuadraticCost(1.0, 1.0, 2, 1, low=-2.0, high=2.0)
 LQR, PENDULUM_LQR = adp.LQR(TWO, COST), adp.LQR(PENDULUM, COST)
 RINGS = st.rings(3)
 WINDOWS = adp.IntegralWindows(PARAMETRIC, 0.04)
@@ -99,6 +100,60 @@ def observed(kind: Any, noise: Any = (0.01,), process: Any = 0.01, mass: Any = 1
 def identified(windows: Any = WINDOWS, law: Any = LAW, **settings: Any) -> Run:
     control = adp.AdaptiveLQR(PARAMETRIC, PENDULUM_COST, windows, law, doublings=3, **settings)
     return loop(control, PARAMETRIC, PENDULUM_COST)
+
+
+def sampled(mass: Any = 1.0, **settings: Any) -> Run:
+    problem = adp.SampledProblem.of(systems.Pendulum(mass), LIMITED, dt=0.02)
+    given = {"noise": 0.5, "temperature": 0.1, **settings}
+    return loop(adp.PathIntegral(problem, steps=4, samples=5, knots=2, compile=False, **given), PENDULUM)
+
+
+def pumped(mass: Any = 1.0, gain: Any = 1.0, capture: Any = 1.0) -> Run:
+    def energy(x: Tensor) -> Tensor:
+        return 0.5 * x[..., 1] ** 2 + 9.81 * x[..., 0].cos()
+
+    pump = adp.EnergyShaping(systems.Pendulum(mass), LIMITED, energy, gain=gain, capture=capture)
+    return loop(adp.Feedback(pump), PENDULUM)
+
+
+def tracked(**settings: Any) -> Run:
+    gains = {"length": 0.04, "feedback": 1.0, "gain": 1.0, "rate": 1.0, **settings}
+
+    def still(x: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.zeros_like(x[:, :1]), torch.zeros_like(x[:, :1])
+
+    return loop(adp.ConcurrentTracker(PARAMETRIC, still, **gains), PARAMETRIC)
+
+
+def boxed(low: Any = -3.0, high: Any = 2.0) -> Run:
+    box = systems.Barrier(systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]]), [low, -9.0], [high, 9.0])
+    return loop(adp.Feedback(adp.BoxFilter(adp.LQR(box, COST), box, dt=0.02)), box)
+
+
+def stated(mass: Any = 1.0) -> Run:
+    def rate(x: Tensor, u: Tensor) -> Tensor:
+        return torch.stack((x[..., 1], u[..., 0] - mass * x[..., 0]), dim=-1)
+
+    plant = systems.RatePlant(rate, dim=2, inputs=1)
+    return loop(adp.LQR(plant, COST), plant)
+
+
+def improved(mass: Any = 1.0, weight: Any = 1.0, radius: Any = 0.1) -> Run:
+    cost = adp.QuadraticCost(weight, 1.0, 2, 1)
+    policy = adp.near_optimal(systems.Pendulum(mass), cost, dt=0.05, radius=radius, reach="local")
+    return lambda rows, real: policy(X0[rows].to(real))
+
+
+def optimum(mass: Any = 1.0, weight: Any = 1.0, terminal: Any = 1.0) -> Run:
+    cost = adp.QuadraticCost(weight, 1.0, 2, 1)
+    settings = {"terminal": terminal, "horizon": 0.5, "intervals": 4}
+    shooting = adp.DirectShooting(systems.Pendulum(mass), cost, **settings)
+
+    def run(rows: slice, real: torch.dtype) -> Any:
+        found = shooting.solve(0.3 * X0[rows].to(real))
+        return found.value, found.gradient, found.state, found.plan, found.converged
+
+    return run
 
 
 def drift(**settings: Any) -> Run:
@@ -352,5 +407,24 @@ CASES: dict[str, Case] = {
         },
         lambda **n: drift(**n),
         1e-9,
+    ),
+    # what plans and guards
+    "path_integral": Case(
+        {"mass": (0.8, 1.2), "noise": (0.3, 0.5), "temperature": (0.1, 0.2)}, lambda **n: sampled(**n)
+    ),
+    "energy_shaping": Case(
+        {"mass": (0.8, 1.2), "gain": (1.0, 2.0), "capture": (0.5, 1.0)}, lambda **n: pumped(**n)
+    ),
+    "concurrent_tracker": Case(
+        {"length": (0.04, 0.05), "feedback": (1.0, 2.0), "gain": (1.0, 2.0), "rate": (1.0, 1.5)},
+        lambda **n: tracked(**n),
+    ),
+    "box_filter": Case({"low": (-3.0, -2.0), "high": (2.0, 3.0)}, lambda **n: boxed(**n)),
+    "rate_plant": Case({"mass": (0.8, 1.2)}, lambda **n: stated(**n)),
+    "near_optimal": Case(
+        {"mass": (0.8, 1.2), "weight": (0.5, 2.0), "radius": (0.05, 0.1)}, lambda **n: improved(**n)
+    ),
+    "direct_shooting": Case(
+        {"mass": (0.8, 1.2), "weight": (0.5, 2.0), "terminal": (0.5, 1.0)}, lambda **n: optimum(**n), 1e-13
     ),
 }

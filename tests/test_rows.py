@@ -269,14 +269,72 @@ def test_a_plan_of_rows_is_followed_in_a_loop() -> None:
     assert torch.equal(found[1:], wanted)
 
 
-def test_what_does_not_serve_rows_yet_says_so() -> None:
-    plant, cost = systems.Pendulum(mass=st.rows(spread(1.0, 2.0))), adp.QuadraticCost(1.0, 1.0, 2, 1)
-    for make in (
-        lambda: adp.near_optimal(plant, cost, dt=0.1),
-        lambda: adp.DirectShooting(plant, cost, horizon=1.0),
-    ):
-        with pytest.raises(ValueError, match="must have no numbers of a row's own"):
-            make()
+def test_near_optimal_of_rows_that_look_ahead_differently_far_is_that_of_single_plants_to_the_bit() -> None:
+    rates, weights, x0 = spread(0.0, 3.0, 4), spread(1.0, 2.0, 4), starts(4)[:, :1]
+    cost = adp.QuadraticCost(1.0, 1.0, 1, 1)
+
+    def made(matrix: Any, weight: Any) -> Any:
+        plant = systems.Linear(matrix, [[1.0]])
+        return adp.near_optimal(plant, adp.QuadraticCost(weight, 1.0, 1, 1), dt=0.1)
+
+    alone = [made(-rate.view(1, 1), float(weight)) for rate, weight in zip(rates, weights, strict=True)]
+    many = made(st.rows(-rates.view(-1, 1, 1)), st.rows(weights))
+    assert len({each.steps for each in alone}) > 1
+    with lanes.compiling("never"):
+        found = many(x0)
+        for row, each in enumerate(alone):
+            assert torch.equal(found[row : row + 1], each(x0[row : row + 1]))
+    with lanes.compiling("always"):
+        assert torch.equal(many(x0)[1:2], alone[1](x0[1:2]))
+    assert torch.equal(many.value(x0)[-1:], alone[-1].value(x0[-1:]))
+    assert many(x0.float()).dtype == torch.float32
+    spoilt = torch.cat((x0[:1] + torch.nan, x0[1:]))
+    assert torch.equal(many(spoilt)[1:], found[1:])
+    with pytest.raises(ValueError, match=r"a batch of 3 rows met numbers of `rows\(\.\.\.\)` for 4"):
+        many(x0[:3])
+    with pytest.raises(ValueError, match=r"`NearOptimal.report\(plant=...\)` must have no numbers of a row"):
+        many.report()
+    with pytest.raises(ValueError, match=r"must be positive.*\(in row 1\)"):
+        adp.near_optimal(systems.Linear([[0.0]], [[1.0]]), cost, dt=0.1, radius=st.rows(spread(1.0, -1.0, 2)))
+
+
+def test_rows_of_several_kinds_stand_behind_one_filter() -> None:
+    plant = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
+    lqr, x0 = adp.LQR(plant, adp.QuadraticCost(1.0, 1.0, 2, 1)), torch.tensor([[0.2, -1.0]]).double()
+    share, decays = torch.tensor([0.0, 1.0, 0.0]).double(), spread(1.0, 3.0)
+
+    def safe(share: Any, decay: Any) -> adp.SafetyFilter:  # of relative degree two, or of one
+        return adp.SafetyFilter(
+            lqr, plant, lambda x, t: x[:, 0] + share * x[:, 1] + 0.5, dt=0.05, low=-3.0, high=3.0, decay=decay
+        )
+
+    many = safe(st.rows(share), st.rows(decays))
+    x0 = x0.expand(FEW, 2)
+    with lanes.compiling("never"):
+        found = many.restrain(x0, lqr(x0))
+        for row in range(FEW):
+            one = safe(share[row], float(decays[row])).restrain(x0[:1], lqr(x0[:1]))
+            for got, want in zip(found, one, strict=True):
+                assert torch.equal(got[row : row + 1], want)
+
+
+def test_a_row_without_an_optimum_spoils_no_other_and_says_why() -> None:
+    plant, cost = systems.Pendulum(mass=st.rows(spread(*MASSES))), adp.QuadraticCost(1.0, 1.0, 2, 1)
+    x0, shooting = 0.3 * starts(FEW), adp.DirectShooting(plant, cost, horizon=0.5, intervals=4)
+    found = shooting.solve(x0)
+    x0[0] = torch.nan
+    spoilt = shooting.solve(x0)
+    assert spoilt.reason[0].startswith("the cost is not finite")
+    assert torch.equal(spoilt.value[1:], found.value[1:])
+    with pytest.raises(ValueError, match=r"a batch of 4 rows met numbers of `rows\(\.\.\.\)` for 3"):
+        shooting.solve(starts(4))
+
+
+def test_what_does_not_serve_rows_says_so() -> None:
+    cost = adp.QuadraticCost(st.rows(spread(1.0, 2.0)), 1.0, 1, 1)
+    problem = adp.SampledProblem.of(systems.Linear([[0.0]], [[1.0]]), cost, dt=0.1)
+    with pytest.raises(ValueError, match="must have no numbers of a row's own"):
+        adp.learn_global_value(problem, [1.0], steps=4)
 
 
 def test_a_rule_names_the_first_row_that_breaks_it() -> None:

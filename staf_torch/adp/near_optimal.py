@@ -18,7 +18,7 @@ from ..lanes import ready, where_rows
 from ..lanes.gradients import defer_gradient, marked, without_gradient
 from ..lanes.opaque import opaque
 from ..lanes.row_decisions import at_once, is_of_rows, most_of_rows, numbers_of_rows
-from ..lanes.row_numbers import in_use, rows_by_kind, rows_of_numbers, some_rows, spread_rows, tried
+from ..lanes.row_numbers import all_rows, in_use, rows_by_kind, rows_of_numbers, some_rows, spread_rows, tried
 from ..lanes.row_objects import Kind, kinds_of_rows, of_kinds, refuse_rows, row_of, whichever
 from ..numerics.checks import choice, flag, integer, positive_real
 from ..numerics.default_device import beside
@@ -36,7 +36,15 @@ from .policies.rollout import ball_directions
 from .policies.sampled_rollout import SampledRollout
 from .problem.cost import Cost
 from .problem.held_linear import held_stability
-from .problem.rules import check_endless, check_still, check_torch, held_period, regulated, slowest, warn_if_short
+from .problem.rules import (
+    check_endless,
+    check_still,
+    check_torch,
+    held_period,
+    regulated,
+    slowest,
+    warn_if_short,
+)
 from .problem.sampled import SampledProblem
 from .reach import Reach, arrived, drawn, extended, looked, whole
 
@@ -70,6 +78,7 @@ class NearOptimal(SampledRollout):
     """
 
     largest = ("steps",)
+
     def __init__(
         self,
         basis: StaFBasis,
@@ -131,7 +140,7 @@ class NearOptimal(SampledRollout):
         return made
 
     def _by_kind(self, name: str, x: Tensor, size: int) -> Tensor:
-        """Return what a method of the kind of every row returns: (B, ..., n) -> (B, ..., size), or (B, ...)."""
+        """Return what a method of the kind of every row returns: (B, ..., n) to (B, ..., size) or (B, ...)."""
         kind, methods = self.get_buffer("kind"), [getattr(each, name) for each in self.kinds]
         x = x if x.dim() > 1 else x.expand(rows_of_numbers(kind), -1)
         like = x.new_zeros(*x.shape[:-1], *([size] if size else []))
@@ -160,7 +169,8 @@ class NearOptimal(SampledRollout):
     def __repr__(self) -> str:
         plant, cost, reach = self.plant, self.cost, self.reach
         way = "the LQR and its rollouts" if self.memory is None else "a global value"
-        known = "" if reach.regulated is None else f", {100 * reach.regulated:.0f} % of it regulated"
+        least = None if reach.regulated is None else float(all_rows(torch.as_tensor(reach.regulated)).min())
+        known = "" if least is None else f", {100 * least:.0f} % of it regulated"
         box = ", ".join(map(shown, reach.box))
         return (
             f"NearOptimal({type(plant).__name__}, {sizes(cost.dim, cost.inputs)}, held for "

@@ -39,7 +39,9 @@ class Reach(NamedTuple):
 
     way: str  # ``local``: the LQR and its rollouts; ``global``: a memory of optimal trajectories
     box: tuple[float, ...]  # half widths, in units of the state
-    regulated: float | Tensor | None  # share of a sample that ends within 1 % of where it began; None: nobody looked
+    regulated: (
+        float | Tensor | None
+    )  # share of a sample that ends within 1 % of where it began; None: nobody looked
     over_best: float | None  # mean cost over that of the best trajectories known, of the regulated
     base: float | Tensor | None  # share that the LQR within its bounds regulates
     note: str = ""  # why nobody looked, or why there is no global value
@@ -89,7 +91,7 @@ def looked(policy: SampledRollout, lqr: LQR, box: Tensor, settles: Tensor, way: 
         settles: periods after which the slowest mode of the base has fallen to 1e-4, ().
         way: ``auto`` or ``global``.
     """
-    cost, x0, widths = policy.cost, sample(policy.cost, box), tuple(box.tolist())
+    x0, widths = sample(policy.cost, box), tuple(box.tolist())
     if type(policy.plant) is Linear and not policy.bounds.present and way == "auto":
         return None
     base = follow_base(policy, x0, 2 * settles)
@@ -185,7 +187,12 @@ def follow_base(policy: SampledRollout, x0: Tensor, periods: Tensor) -> Followed
         periods: at most, ().
     """
     x, paid, began, since = x0, torch.zeros_like(x0[:, 0]), time.thread_time(), time.monotonic()
-    good, known, k, problems = torch.zeros_like(paid, dtype=torch.bool), paid[0] < 0, 0, rows_of(policy.metric)
+    good, known, k, problems = (
+        torch.zeros_like(paid, dtype=torch.bool),
+        paid[0] < 0,
+        0,
+        rows_of(policy.metric),
+    )
     while in_any_row(~known):
         k += 1
         moved, spent = policy.holding(x, policy.bounds.clip(policy.base(x)))

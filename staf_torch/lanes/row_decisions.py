@@ -143,7 +143,7 @@ def numbers_of_rows(function: Callable[[], tuple[Tensor, ...]], most: int | None
 
 
 def spread_object(value: Some, rows: Tensor, count: int) -> Some:
-    """Return an object with numbers of these rows (R,) as one with numbers of all: others have the first's."""
+    """Return an object of these rows (R,) as one of all rows: the others have the first's numbers."""
     place = torch.zeros(count, dtype=torch.int64, device="cpu")
     place[rows] = torch.arange(len(rows), device="cpu")
 

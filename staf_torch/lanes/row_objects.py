@@ -173,7 +173,7 @@ def of_kinds(kinds: Sequence[Kind]) -> Any:
 
 
 def whichever(kind: Tensor, bodies: Sequence[Callable[[Any], Any]], given: Any, like: Any) -> Any:
-    """Return what the function of a row's kind returns, trees (B, ...) to (B, ...), as ``like`` where none is."""
+    """Return what the function of a row's kind returns: trees (B, ...) to (B, ...), in place of ``like``."""
     count = len(flatten(given)[0][0])
     for k, body in enumerate(bodies):
         like = where_rows((kind == k).expand(count), body, given, like)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -12,9 +12,9 @@ from torch.nn.functional import pad
 
 from ...lanes.contents import is_users, version
 from ...lanes.gradients import gradients_of, marked
+from ...lanes.loops import where_rows
 from ...lanes.one_thread import small
 from ...lanes.row_numbers import over_rows
-from ...lanes.loops import where_rows
 from ...lanes.row_objects import OfRows
 from ...numerics.checks import real, trailing
 from ...numerics.default_device import beside

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ...lanes.gradients import without_gradient
 from ...lanes.opaque import opaque
+from ...lanes.row_objects import refuse_rows
 from ...numerics.checks import fail, integer, real
 from ...signs import Sign
 from ..problem.sampled import SampledProblem
@@ -88,6 +89,7 @@ def learn_global_value(
     """
     if not 0 < real("learn_global_value", "enough", enough) <= 1:
         raise fail("learn_global_value", "enough", "must be in (0, 1]", enough)
+    refuse_rows("learn_global_value", problem=problem)
     check_memorable("learn_global_value", problem)
     integer("learn_global_value", "trajectories", trajectories, least=2)
     integer("learn_global_value", "rounds", rounds, least=0)

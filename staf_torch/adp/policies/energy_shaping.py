@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 
+from ...lanes.row_objects import OfRows
 from ...numerics.checks import fail, positive_real, trailing
 from ...systems import ControlAffineSystem
 from ..loop.controller import LQR
@@ -14,7 +16,7 @@ from ..problem.cost import Cost
 from ..problem.shapes import check_value
 
 
-class EnergyShaping(nn.Module):
+class EnergyShaping(nn.Module, metaclass=OfRows):
     """u = clip(u_s - gain (E(x) - E(x_s)) g(x)' grad E(x)) far from the goal x_s, the LQR near to it.
 
     Without friction E' = grad E'g u, so that outside of the region of the LQR |E - E(x_s)| falls wherever the
@@ -45,6 +47,8 @@ class EnergyShaping(nn.Module):
 
     Source: Åström and Furuta, "Swinging up a pendulum by energy control", Automatica 36 (2000).
     """
+
+    rowwise: ClassVar = {"forward": (1,)}
 
     def __init__(
         self,

@@ -15,6 +15,7 @@ from torch.nn.functional import pad
 from ...lanes.gradients import without_gradient
 from ...lanes.one_thread import small
 from ...lanes.row_numbers import nonzero
+from ...lanes.row_objects import made_by_rows
 from ...numerics.checks import fail, positive_real
 from ...numerics.default_device import designed_on_cpu
 from ...numerics.differences import STEP, central_slopes
@@ -190,8 +191,12 @@ def held_stability(
         ValueError: if the period breaks its rule, or the plant is clocked and ``at`` is missing.
     """
     positive_real("held_stability", "period", period)
-    loop = HeldLoop.of(policy, system, at=at)
-    return HeldStability(loop.spectral_radius(period), loop.largest_period())
+
+    def found() -> HeldStability:
+        loop = HeldLoop.of(policy, system, at=at)
+        return HeldStability(loop.spectral_radius(period), loop.largest_period())
+
+    return made_by_rows(found)
 
 
 class HeldLoop(NamedTuple):

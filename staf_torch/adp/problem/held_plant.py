@@ -316,7 +316,9 @@ class Holding:
                 found, self.table = dear, self._with(dear.number, linear).table
         self.least = self.steps = found.number
         self.error = found.error if is_of_rows(found.error) else float(found.error)
-        if not bool(found.error <= (_OUTSIDE if found.number == 1 and self.table is None else GRACE) * TOLERANCE):
+        if not bool(
+            found.error <= (_OUTSIDE if found.number == 1 and self.table is None else GRACE) * TOLERANCE
+        ):
             _log.warning(
                 "%s: with %d integration steps a period of %.4g s the next state is wrong by %.2g of its "
                 "size (wanted: %.0e): the rate is too fast for this dt, or has corners.",

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from ...lanes.row_decisions import numbers_of_rows, of_first
+from ...lanes.row_numbers import nonzero
 from ...numerics.checks import fail, positive_real
 from ...systems import Bounds, Clocked, Plant
 from ...systems.equilibria import check_rest
@@ -47,7 +48,7 @@ def check_still(call: str, argument: str, plant: Plant, instead: str) -> None:
 
 def check_undiscounted(call: str, cost: Cost) -> None:
     """Refuse a cost with a discount."""
-    if cost.discount:
+    if nonzero(cost.discount):
         raise fail(call, "cost", "must have no discount", cost.discount)
 
 

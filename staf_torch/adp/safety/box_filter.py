@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from ...lanes import compiled, repeat
+from ...lanes.row_objects import OfRows
 from ...numerics.checks import fail, positive_real, trailing
 from ...numerics.default_device import device_of
 from ...numerics.runge_kutta import runge_kutta_mean, runge_kutta_stages
 from ...systems import Barrier, Bounds
 from ..loop.controller import Policy
-from .quadratic_program import cases, nearest_admissible
+from .quadratic_program import cases, nearest_admissible, sides_of
 
 _LEFT, _LEAST = (
     0.5,
@@ -33,7 +34,7 @@ class Held(NamedTuple):
     rates: tuple[Tensor, Tensor, Tensor]  # x' at the beginning, in the middle and at the end
 
 
-class BoxFilter(nn.Module):
+class BoxFilter(nn.Module, metaclass=OfRows):
     """The control nearest to what a policy wants that keeps x in the box of a `Barrier` until it is renewed,
     and leaves room to brake from then on:
 
@@ -76,6 +77,8 @@ class BoxFilter(nn.Module):
             speed.
     """
 
+    rowwise: ClassVar = {"hold": (1,), "inequalities": (1, 1, 0, 0)}
+
     def __init__(self, policy: Policy, box: Barrier, *, dt: float, renewed: bool = False) -> None:
         super().__init__()
         if not isinstance(box, Barrier):
@@ -96,7 +99,7 @@ class BoxFilter(nn.Module):
                 "`BoxFilter(box=...)` must have inputs that move every walled coordinate or its speed; not "
                 f"so coordinate {self.walls[self.degree.index(0)][0]}."
             )
-        table = cases(len(self.walls), self.bounds.low.tolist(), self.bounds.high.tolist())
+        table = cases(len(self.walls), *sides_of(self.bounds))
         self.register_buffer("table", table.to(device_of(box)))
         self.table: Tensor
 

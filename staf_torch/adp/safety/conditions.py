@@ -106,7 +106,12 @@ class Conditions(nn.Module):
         self.moving = bool((values != values[:1]).any())
         self.degree = self._degrees(degree, x, t)
         found = _brakes(self, x, t)
-        self.braked, self.limited, self.weak, self.apart = found.braked, found.limited, found.weak, found.apart
+        self.braked, self.limited, self.weak, self.apart = (
+            found.braked,
+            found.limited,
+            found.weak,
+            found.apart,
+        )
         self.register_buffer("brakes", found.constant)
         self.register_buffer("usual", found.usual)
         self.brakes: Tensor  # (k,)

@@ -199,9 +199,7 @@ class LookAhead(nn.Module):
             lean = Lean(*of.every(of.lean, x, t))
             able = torch.where(lean.ability > 0, lean.ability, 1.0)
             left = torch.where(second & (lean.ability > 0), _speed(lean) / able, 0.0).amax(-1) / _SHARE
-            length = torch.where(
-                left > of.hold, torch.where(left < longest, left, longest), of.hold
-            )
+            length = torch.where(left > of.hold, torch.where(left < longest, left, longest), of.hold)
             u = rest + strength * (self.hardest(lean) - rest)
             x, t, ends = self._moved(x, u, t, value, rate, length)
             going = (ends.last_rate < 0) | ((weak | ~second) & (lean.ability < 0))

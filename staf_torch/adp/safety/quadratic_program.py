@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from ...lanes import each, repeat
+from ...systems import Bounds
 
 MOST_CASES = 1000  # sets of active inequalities and bounds that are compared at most
 _ROUNDED, _OWN = 64, 2**20  # roundings by which a point may miss an inequality, and one on whose edge it is
@@ -75,6 +76,12 @@ def cases(count: int, low: Sequence[float], high: Sequence[float]) -> Tensor:
         )
     held = [(*ones, *sides) for ones in active[1:] for sides in itertools.product(*bounds)]
     return torch.tensor([(0,) * (count + len(bounds)), *held], dtype=torch.float64, device="cpu")
+
+
+def sides_of(bounds: Bounds) -> tuple[list[float], list[float]]:
+    """Return bounds for `cases`, which reads where there are some: 0 in place of the finite ones."""
+    low, high = (torch.where(torch.isfinite(end), 0.0, end).tolist() for end in (bounds.low, bounds.high))
+    return low, high
 
 
 def nearest_admissible(

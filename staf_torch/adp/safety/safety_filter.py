@@ -25,7 +25,7 @@ from ..loop.result import LoopResult
 from ..problem.shapes import check_plant
 from .conditions import Conditions, Constraint, Lean, check_traceable, listed
 from .look_ahead import LookAhead
-from .quadratic_program import cases, nearest_admissible
+from .quadratic_program import cases, nearest_admissible, sides_of
 
 _log = logging.getLogger(__name__)
 INFEASIBLE = 1e-6  # slack, in units of the input, from which on a row counts as infeasible
@@ -189,8 +189,7 @@ class SafetyFilter(Controller):
         device = device_of(plant)
         self.register_buffer("unit", heavy.rsqrt().to(device))
         self.unit: Tensor  # (m,) of an input, in which distances are measured
-        sides = (torch.where(torch.isfinite(end), 0.0, end) for end in (self.bounds.low, self.bounds.high))
-        self.register_buffer("table", cases(count, *(side.tolist() for side in sides)).to(device))
+        self.register_buffer("table", cases(count, *sides_of(self.bounds)).to(device))
         self.table: Tensor
         self.ahead = LookAhead(self.conditions, self._policy)
         if self.ahead.acts:
@@ -379,7 +378,7 @@ class SafetyFilter(Controller):
         return found.reshape(*z.shape[:-1], -1)
 
     def nearest(self, z: Tensor) -> Tensor:
-        """`_nearest` in plain torch, of rows that are of this kind among others: (B, n + m + 1) -> (B, ...)."""
+        """`_nearest` in plain torch, of rows of this kind among others: (B, n + m + 1) -> (B, m + k + 2)."""
         found: Tensor = self._nearest.definition(z)
         return found if self.opposed else torch.cat((found, torch.zeros_like(found[:, :1])), dim=-1)
 

@@ -11,7 +11,9 @@ from torch import Tensor
 
 from ....lanes.gradients import without_gradient
 from ....lanes.opaque import opaque
-from ....lanes.row_objects import refuse_rows
+from ....lanes.row_decisions import decided, numbers_of_rows
+from ....lanes.row_numbers import over_rows, points_of_rows, some_rows
+from ....lanes.row_objects import made_by_rows
 from ....numerics.checks import fail, integer, positive_real, trailing
 from ....numerics.default_device import beside, on_cpu
 from ....numerics.linalg import Matrix, positive_semidefinite, square
@@ -146,23 +148,22 @@ class DirectShooting:
         if cost.ending is not None and horizon is None:
             raise fail("DirectShooting", "horizon", "must be given beside a terminal cost", None)
         check_undiscounted("DirectShooting", cost)
-        refuse_rows("DirectShooting", system=system, cost=cost)
         check_problem(system, cost)
         self.stage = Interval(system, cost)
         rates = (1.0, 0.0)
         self.lqr: LQR | None = None
         if base is None or terminal is None or horizon is None or intervals is None:
             self.lqr = self._regulator(horizon, terminal is None and cost.ending is None)
-            rates = rates if self.lqr is None else rates_of(system, self.lqr)
+            if (lqr := self.lqr) is not None:
+                slow, fast = numbers_of_rows(lambda: rates_of(system, lqr)).numbers
+                rates = float(slow.min()), float(fast.max())
         given = () if base is None else tuple(base) if isinstance(base, Sequence) else (base,)
         if not given or (len(given) > 1 and self.lqr is not None):
             given = (*given, self._resting if self.lqr is None else self.lqr)
         check_policy("DirectShooting", "base", cost, *given)
         self.bases, self.alone = given, base is None and self.lqr is None
         self.terminal = self._end(terminal)
-        x = set_point(system, cost)[0]
-        ends = float(self.terminal(x.unsqueeze(0)).abs())
-        self.stays = ends <= _NOTHING and not restless(system, cost)
+        self.stays = made_by_rows(self._stays)  # 1 where the optimum at the set-point is to stay, else 0
         self.quadratic_end = not callable(cost.ending if terminal is None else terminal)
         self.stated = (horizon, intervals)
         chosen = _DECAY / rates[0] if horizon is None else horizon
@@ -181,6 +182,11 @@ class DirectShooting:
         self.seed = integer("DirectShooting", "seed", seed, least=0)
         self._searches: dict[tuple[float, int], PlanSearch | None] = {}
 
+    def _stays(self) -> float:
+        system, cost = self.stage.system, self.stage.cost
+        ends = self.terminal(set_point(system, cost)[0].unsqueeze(0)).abs()
+        return float(bool(ends <= _NOTHING) and not restless(system, cost))
+
     def _regulator(self, horizon: float | None, ends: bool) -> LQR | None:
         """The LQR of the problem; None where there is none and a horizon does without.
 
@@ -190,7 +196,7 @@ class DirectShooting:
         """
         cost, system = self.stage.cost, self.stage.system
         try:
-            check_regulates("DirectShooting", system, cost)
+            decided(lambda: check_regulates("DirectShooting", system, cost))
             return LQR(system, cost)
         except ValueError as error:
             why = str(error)
@@ -221,10 +227,19 @@ class DirectShooting:
                 return cost.terminal
             return (lambda x: torch.zeros_like(x[..., 0])) if self.lqr is None else self.lqr.value
         if callable(terminal):
-            return check_value("DirectShooting", "terminal", terminal, cost)
-        end = square("DirectShooting", "terminal", terminal, cost.dim)
-        end = positive_semidefinite("DirectShooting", "terminal", end, cost.dim)
-        return lambda x: quadratic(end, cost.deviation(x))
+            own = check_value("DirectShooting", "terminal", terminal, cost)
+        else:
+
+            def checked() -> Tensor:
+                end = square("DirectShooting", "terminal", terminal, cost.dim)
+                return positive_semidefinite("DirectShooting", "terminal", end, cost.dim)
+
+            end = made_by_rows(checked)
+
+            def own(x: Tensor) -> Tensor:
+                return quadratic(end, cost.deviation(x))
+
+        return lambda x: over_rows(own, x)
 
     def __repr__(self) -> str:
         over = f"{self.intervals} intervals over {self.horizon:.4g} s, {self.starts} starts"
@@ -249,10 +264,11 @@ class DirectShooting:
             there = None if warm is None else warm.to(torch.device("cpu"))
             return self.solve(x0.cpu(), warm=there).to(x0.device)
         parts = list[Optimum]()
-        with Sign("", len(x0), "states") as sign:
+        with Sign("", len(x0), "states") as sign, points_of_rows(len(x0), 1):
             for k, rows in enumerate(x0.split(ROWS)):
                 at = k * ROWS + torch.arange(len(rows), device=x0.device)
-                parts.append(self._solve(rows, None if warm is None else selected(warm, at)))
+                with some_rows(at):
+                    parts.append(self._solve(rows, None if warm is None else selected(warm, at)))
                 sign.advance(len(rows))
         return parts[0] if len(parts) == 1 else joined(parts)
 
@@ -278,20 +294,22 @@ class DirectShooting:
         if not bool(hard.any()):  # costs time alone
             return found
         rows = hard.nonzero().flatten()
-        plans = self._guessed(x0[rows], time)
-        if warm is not None:
-            plans.append(self._warm(warm, x0[rows], rows, time))
         search = self._search(time)
-        if search is not None and self.stage.cost.bounds is not None:
-            plans += [self._replayed(plan, time.diff()) for plan in search.held(x0[rows])]
-        plans = cheapest(plans, self.starts, start.cost[rows])
-        if self.stage.cost.output is not None:  # plans that end with the base see one valley of the cost
-            plans.append(follow(self, _always(self._resting), x0[rows], time.diff()))
+        with some_rows(rows):
+            plans = self._guessed(x0[rows], time)
+            if warm is not None:
+                plans.append(self._warm(warm, x0[rows], rows, time))
+            if search is not None and self.stage.cost.bounds is not None:
+                plans += [self._replayed(plan, time.diff()) for plan in search.held(x0[rows])]
+            plans = cheapest(plans, self.starts, start.cost[rows])
+            if self.stage.cost.output is not None:  # plans that end with the base see one valley of the cost
+                plans.append(follow(self, _always(self._resting), x0[rows], time.diff()))
         found = self._several(found, rows, plans, time)
         local = (hard & ~found.converged & torch.isfinite(found.value)).nonzero().flatten()
         if search is None or not len(local):
             return found
-        plans = [self._replayed(plan, time.diff()) for plan in search.remembered(x0[local])]
+        with some_rows(local):
+            plans = [self._replayed(plan, time.diff()) for plan in search.remembered(x0[local])]
         return self._several(found, local, plans, time)
 
     def _mesh(self, horizon: float, intervals: int) -> Tensor:
@@ -307,7 +325,8 @@ class DirectShooting:
         # All starts of all rows are one batch: what a step costs hardly depends on its size.
         together = MeshPlan(*(torch.cat(parts) for parts in zip(*plans, strict=True)))
         x0 = together.state[:, 0]
-        improved = self._improve(together, time, x0, self.bases[0])
+        with some_rows(rows.repeat(len(plans))):
+            improved = self._improve(together, time, x0, self.bases[0])
         places = torch.arange(len(rows), device=rows.device)
         several = [selected(improved, k * len(rows) + places) for k in range(len(plans))]
         return merged(found, rows, several)
@@ -346,7 +365,7 @@ class DirectShooting:
         """Return where the optimum is to stay: at the set-point up to rounding, or at no cost, (B,) bool."""
         rounding = _ROUNDED * torch.finfo(x0.dtype).eps * x0.abs()
         here = (self.stage.cost.deviation(x0).abs() <= rounding).all(-1) | (value == 0)
-        return here & self.stays
+        return here & over_rows(lambda value: torch.ones_like(value) * self.stays > 0, value)
 
     def _graded(self) -> bool:
         """Return whether intervals grow along a mesh: without bounds, or if one start finds the optimum."""
@@ -360,24 +379,29 @@ class DirectShooting:
 
     def _guessed(self, x0: Tensor, time: Tensor) -> list[MeshPlan]:
         lengths, horizon = time.diff(), float(time[-1])
-        plans = [follow(self, _always(base), x0, lengths) for base in self.bases]
-        for base in self.bases:
-            several = guesses(self.stage.cost, base, x0, horizon, _SPLINES, self.seed, alone=self.alone)
-            plans += [follow(self, guided(guess, base), x0, lengths) for guess in several]
-        return plans
+
+        def plans(x0: Tensor) -> list[MeshPlan]:
+            found = [follow(self, _always(base), x0, lengths) for base in self.bases]
+            for base in self.bases:
+                several = guesses(self.stage.cost, base, x0, horizon, _SPLINES, self.seed, alone=self.alone)
+                found += [follow(self, guided(guess, base), x0, lengths) for guess in several]
+            return found
+
+        return list(over_rows(plans, x0))
 
     def _warm(self, warm: Optimum, x0: Tensor, rows: Tensor, time: Tensor) -> MeshPlan:
         """An earlier plan, held open loop on this mesh."""
-        runner = warm.replay()
-        runner.plan = runner.plan[rows]
 
-        def control(x: Tensor, t: float) -> Tensor:
-            k = min(int(torch.searchsorted(warm.time, t, right=True)) - 1, len(warm.time) - 2)
-            share = float((t - warm.time[k]) / (warm.time[k + 1] - warm.time[k]))
-            first, last = runner.plan[:, k].unbind(1)
-            return first + min(share, 1.0) * (last - first)
+        def held(x0: Tensor, plan: Tensor) -> MeshPlan:
+            def control(x: Tensor, t: float) -> Tensor:
+                k = min(int(torch.searchsorted(warm.time, t, right=True)) - 1, len(warm.time) - 2)
+                share = float((t - warm.time[k]) / (warm.time[k + 1] - warm.time[k]))
+                first, last = plan[:, k].unbind(1)
+                return first + min(share, 1.0) * (last - first)
 
-        return follow(self, control, x0, time.diff())
+            return follow(self, control, x0, time.diff())
+
+        return over_rows(held, x0, warm.plan[rows])
 
     def _improve(self, start: MeshPlan, time: Tensor, x0: Tensor, base: Policy) -> Optimum:
         """Newton's method on two meshes from a plan on the coarse one."""

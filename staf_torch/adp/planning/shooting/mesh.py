@@ -52,8 +52,8 @@ def split(stage: Interval, plan: MeshPlan, feedback: Tensor, lengths: Tensor) ->
     return MeshPlan(state, control, plan.cost), feedback.repeat_interleave(2, dim=1)
 
 
-def rates_of(system: Plant, lqr: LQR) -> tuple[float, float]:
-    """The slowest decay and the fastest rate of the LQR's modes, 1/s."""
+def rates_of(system: Plant, lqr: LQR) -> tuple[Tensor, Tensor]:
+    """The slowest decay and the fastest rate of the LQR's modes, 1/s, () each."""
     a, b = system.linearisation(lqr.cost.target, lqr.cost.target_input)
     modes = torch.linalg.eigvals(a.to(lqr.p) - b.to(lqr.p) @ lqr.k)
-    return float(-modes.real.max()), float(modes.abs().max())
+    return -modes.real.max(), modes.abs().max()

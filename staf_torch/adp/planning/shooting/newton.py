@@ -18,6 +18,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from ....lanes.row_numbers import over_rows
 from ....numerics.linalg import row_jacobian, slope_of
 from ....numerics.riccati import riccati_step
 from ....numerics.runge_kutta import SHARES, runge_kutta_mean, runge_kutta_stages, runge_kutta_step
@@ -60,11 +61,17 @@ class Interval:
         """v with hard bounds kept: (..., 2m) -> (..., 2m)."""
         if self.box is None:
             return v
-        return torch.minimum(torch.maximum(v, self.box[0].to(v)), self.box[1].to(v))
+        low, high = self.box
+        kept: Tensor = over_rows(lambda v: torch.minimum(torch.maximum(v, low.to(v)), high.to(v)), v)
+        return kept
 
     def room(self, v: Tensor) -> tuple[Tensor, Tensor] | None:
         """Return how far v may fall and rise, (..., 2m) each; None without hard bounds."""
-        return None if self.box is None else (self.box[0].to(v) - v, self.box[1].to(v) - v)
+        if self.box is None:
+            return None
+        low, high = self.box
+        found: tuple[Tensor, Tensor] = over_rows(lambda v: (low.to(v) - v, high.to(v) - v), v)
+        return found
 
     def gap(self, x: Tensor, v: Tensor, costate: Tensor) -> Tensor:
         """Return how much the Hamiltonian r + p'f of a control exceeds its minimum over the admissible ones.
@@ -94,8 +101,13 @@ class Interval:
 
     def advance(self, x: Tensor, v: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
         """(..., n), (..., 2m), lengths h (...) in s: x+ (..., n), the cost (...)."""
-        after, at = self.moved(x, v, h)
-        return after, self.paid(at, v, h)
+
+        def step(x: Tensor, v: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
+            after, at = self.moved(x, v, h)
+            return after, self.paid(at, v, h)
+
+        found: tuple[Tensor, Tensor] = over_rows(step, x, v, h)
+        return found
 
     def moved(self, x: Tensor, v: Tensor, h: Tensor) -> tuple[Tensor, list[Tensor]]:
         """x+ as of `advance`, and the four states (..., n) at which the Runge-Kutta step looks."""
@@ -252,11 +264,26 @@ def replay(
 ) -> MeshPlan:
     """The plan's control with feedback around its states and an offset, from x0 (..., B, n)."""
 
-    def control(x: Tensor, k: int) -> Tensor:
-        apart = (x - plan.state[:, k]).unsqueeze(-2)
-        return stage.admitted(plan.control[:, k] + offset[..., k, :] + (feedback[:, k] * apart).sum(-1))
+    def again(x0: Tensor, state: Tensor, planned: Tensor, feedback: Tensor, offset: Tensor) -> MeshPlan:
+        def control(x: Tensor, k: int) -> Tensor:
+            apart = (x - state[:, k]).unsqueeze(-2)
+            return stage.admitted(planned[:, k] + offset[..., k, :] + (feedback[:, k] * apart).sum(-1))
 
-    return _driven(stage, control, x0, lengths, terminal)
+        return _driven(stage, control, x0, lengths, terminal)
+
+    given = plan.state, plan.control, feedback
+    if x0.dim() == 2:
+        return over_rows(again, x0, *given, offset)
+
+    def rows_first(x0: Tensor, *given: Tensor) -> MeshPlan:
+        *same, offset = given
+        return _swapped(again(x0.transpose(0, 1), *same, offset.transpose(0, 1)))
+
+    return _swapped(over_rows(rows_first, x0.transpose(0, 1), *given, offset.transpose(0, 1)))
+
+
+def _swapped(plan: MeshPlan) -> MeshPlan:
+    return MeshPlan(*(part.transpose(0, 1) for part in plan))
 
 
 def _driven(
@@ -335,7 +362,7 @@ def follow(
         v = [stage.cost.unsaturated(control(at, t)) for at, t in ((x, now), (ahead, end - 1e-9 * float(h)))]
         return stage.admitted(torch.cat(v, dim=-1))
 
-    return _driven(stage, both, x0, lengths, problem.terminal)
+    return over_rows(lambda x0: _driven(stage, both, x0, lengths, problem.terminal), x0)
 
 
 def minimise(problem: ShootingProblem, plan: MeshPlan, lengths: Tensor) -> NewtonSolution:

@@ -50,8 +50,7 @@ def guesses(
     for share in _SHARES:
         for i in range(cost.inputs):
             for end in (low, high):
-                level = rest.clone()
-                level[i] = end[i]
+                level = torch.where(torch.arange(cost.inputs, device="cpu") == i, end, rest)
                 found.append(StartControl(level.expand(2, -1), share * horizon))
     generator = torch.Generator().manual_seed(seed)
     for _ in range(count):
