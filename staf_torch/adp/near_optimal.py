@@ -19,7 +19,7 @@ from ..lanes.gradients import defer_gradient, marked, without_gradient
 from ..lanes.opaque import opaque
 from ..lanes.row_decisions import at_once, is_of_rows, most_of_rows, numbers_of_rows
 from ..lanes.row_numbers import all_rows, in_use, rows_by_kind, rows_of_numbers, some_rows, spread_rows, tried
-from ..lanes.row_objects import Kind, kinds_of_rows, of_kinds, refuse_rows, row_of, whichever
+from ..lanes.row_objects import Kind, kinds_of_rows, of_kinds, refuse_rows, row_of, rows, whichever
 from ..numerics.checks import choice, flag, integer, positive_real
 from ..numerics.default_device import beside
 from ..numerics.shown import shown, sizes
@@ -137,19 +137,22 @@ class NearOptimal(SampledRollout):
         """Return the policy of rows that are of several kinds: steps of integration, global values."""
         made: NearOptimal = of_kinds(kinds)
         made.memory, made._planners = None, {}
+        ways = {kind.object.reach.way for kind in kinds}
+        found = Reach(" and ".join(sorted(ways)), made.reach.box, *(None,) * 3, "of rows of several kinds")
+        made.reach = found._replace(**{name: _by_row(kinds, name) for name in Reach._fields[2:5]})
         return made
 
     def _by_kind(self, name: str, x: Tensor, size: int) -> Tensor:
-        """Return what a method of the kind of every row returns: (B, ..., n) to (B, ..., size) or (B, ...)."""
+        """Return what a method of every row's kind returns: (B, ..., n) to (B, ..., size) or (B, ...)."""
         kind, methods = self.get_buffer("kind"), [getattr(each, name) for each in self.kinds]
         x = x if x.dim() > 1 else x.expand(rows_of_numbers(kind), -1)
         like = x.new_zeros(*x.shape[:-1], *([size] if size else []))
         if not in_use():
             return whichever(kind, methods, x, like)
-        for rows, method in zip(rows_by_kind(kind, len(x), len(methods)), methods, strict=True):
-            if len(rows):
-                with some_rows(rows):
-                    like = like.index_copy(0, rows.to(x.device), method(x[rows.to(x.device)]))
+        for own, method in zip(rows_by_kind(kind, len(x), len(methods)), methods, strict=True):
+            if len(own):
+                with some_rows(own):
+                    like = like.index_copy(0, own.to(x.device), method(x[own.to(x.device)]))
         return like
 
     def controller(self) -> Controller:
@@ -507,6 +510,17 @@ def _periods(seconds: Tensor, period: float) -> Tensor:
 def _settling(decay: Tensor, period: float) -> Tensor:
     """Periods after which the slowest mode, of a decay in 1/s, has fallen to 1e-4."""
     return (_SETTLED / decay / period).ceil()
+
+
+def _by_row(kinds: list[Kind], name: str) -> Tensor:
+    """Return a number of the reaches of all rows; NaN where nobody looked."""
+    found = torch.full((sum(len(kind.rows) for kind in kinds),), math.nan, dtype=torch.float64, device="cpu")
+    for kind in kinds:
+        value = getattr(kind.object.reach, name)
+        if value is not None:
+            full = all_rows(torch.as_tensor(value, dtype=torch.float64, device="cpu"))
+            found[kind.rows] = full[kind.rows] if full.dim() else full
+    return rows(found)  # type: ignore[no-any-return]
 
 
 def _warn_if_slow(policy: NearOptimal) -> None:

@@ -28,6 +28,7 @@ STATES = 24  # drawn from a box, beside the 2 n ends of its axes
 REGULATED = 1e-2  # share of the distance from the set-point that is left
 _LOOK = 16  # periods after which it is looked who arrived
 _BUDGET, _PATIENCE = 0.4, 2.0  # s of the processor, and s, that following the base may take
+_BATCHED = 4.0  # times the time that a problem may take where many are followed at once, in `vmap`
 _DIMS, _INPUTS = 6, 2  # at most, of a plant whose global value is learnt
 _SEED = 7  # of the sample
 _DEAR = 4.0  # times the value of the LQR that it may cost within its bounds, to be a base
@@ -187,21 +188,17 @@ def follow_base(policy: SampledRollout, x0: Tensor, periods: Tensor) -> Followed
         periods: at most, ().
     """
     x, paid, began, since = x0, torch.zeros_like(x0[:, 0]), time.thread_time(), time.monotonic()
-    good, known, k, problems = (
-        torch.zeros_like(paid, dtype=torch.bool),
-        paid[0] < 0,
-        0,
-        rows_of(policy.metric),
-    )
+    good = torch.zeros_like(paid, dtype=torch.bool)
+    known, k = good[0], 0
+    longer = _BATCHED * rows_of(policy.metric) if is_of_rows(policy.metric) else 1.0
     while in_any_row(~known):
         k += 1
         moved, spent = policy.holding(x, policy.bounds.clip(policy.base(x)))
         moved = torch.where(torch.isfinite(moved).all(-1, keepdim=True), moved, torch.nan)
         # What is known of a problem does not change while others go on.
         x, paid = torch.where(known, x, moved), torch.where(known, paid, paid + spent)
-        late = (
-            time.thread_time() - began > problems * _BUDGET or time.monotonic() - since > problems * _PATIENCE
-        )
+        spent_time = time.thread_time() - began, time.monotonic() - since
+        late = spent_time[0] > longer * _BUDGET or spent_time[1] > longer * _PATIENCE
         if k % _LOOK == 0 or late or in_any_row(periods == k):
             here = arrived(policy.cost, x, x0)
             every = k % _LOOK == 0 or late
