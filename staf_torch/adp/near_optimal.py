@@ -137,9 +137,6 @@ class NearOptimal(SampledRollout):
         """Return the policy of rows that are of several kinds: steps of integration, global values."""
         made: NearOptimal = of_kinds(kinds)
         made.memory, made._planners = None, {}
-        ways = {kind.object.reach.way for kind in kinds}
-        found = Reach(" and ".join(sorted(ways)), made.reach.box, *(None,) * 3, "of rows of several kinds")
-        made.reach = found._replace(**{name: _by_row(kinds, name) for name in Reach._fields[2:5]})
         return made
 
     def _by_kind(self, name: str, x: Tensor, size: int) -> Tensor:
@@ -397,6 +394,9 @@ def near_optimal(
     else, and without bounds, ``controller()`` is the policy alone. With ``plan`` it is a `RecedingHorizon`,
     which plans all the time, and the policy as a function of x makes a plan anew, in tens of milliseconds,
     where a bound is met; in a loop two ways around that cost nearly the same would take turns.
+    **Rows.** With numbers of rows (`staf_torch.rows`) every row has its own policy, horizon and steps of
+    integration; all are made at once, but for rows that need a global value, of which each is learnt by itself.
+
     A simulator so slow that a control takes more than half of dt is a warning in the log, with the share.
 
     Example:
@@ -439,14 +439,13 @@ def near_optimal(
             policy.reach, policy.memory = extended(policy, policy.lqr, policy.box, policy.settles, reach)
         return policy
 
-    def looked_at() -> tuple[NearOptimal, bool]:
+    def looked_at() -> tuple[NearOptimal, Reach | None]:
         policy = local(*given)
         if reach != "auto":
-            return policy, reach == "global"
+            return policy, policy.reach if reach == "local" else None
         decay = slowest(policy.lqr, plant, policy.cost, policy.period)
         found = looked(policy, policy.lqr, policy.box, _settling(decay, policy.period), reach)
-        policy.reach = whole(policy.box) if found is None else found.reach or policy.reach
-        return policy, found is not None and found.reach is None
+        return policy, whole(policy.box) if found is None else found.reach
 
     given = plant, cost, low, high, radius
     policy, count = tried(lambda: single(given))
@@ -455,12 +454,30 @@ def near_optimal(
         return policy
     check_torch("near_optimal", "plant", plant)
     parts = at_once(looked_at, count, spread_rows(count))
-    kept = [part for part in parts if not part.found[1]]
+    kept = [part for part in parts if part.found[1] is not None]
     kinds = kinds_of_rows([part.found[0] for part in kept], [part.rows for part in kept], count)
-    for row in sorted(row for part in parts if part.found[1] for row in part.rows.tolist()):
-        alone = single(row_of(given, row))  # a global value is of one problem
-        kinds.append(Kind(torch.tensor([row], dtype=torch.int64, device="cpu"), alone))
-    return kinds[0].object if len(kinds) == 1 < count else NearOptimal.of_kinds(kinds)
+    ways = [(part.rows, part.found[1]) for part in kept]
+    for row in sorted(row for part in parts if part.found[1] is None for row in part.rows.tolist()):
+        alone, own = single(row_of(given, row)), torch.tensor([row], dtype=torch.int64, device="cpu")
+        kinds.append(Kind(own, alone))  # a global value is of one problem
+        ways.append((own, alone.reach))
+    made = kinds[0].object if len(kinds) == 1 and kept else NearOptimal.of_kinds(kinds)
+    made.reach = _reach_of_rows(ways, count)
+    return made  # type: ignore[no-any-return]
+
+
+def _reach_of_rows(ways: list[tuple[Tensor, Reach]], count: int) -> Reach:
+    """Return the reach of all rows: NaN where nobody looked."""
+    numbers = dict[str, Tensor]()
+    for name in ("regulated", "over_best", "base"):
+        full = torch.full((count,), math.nan, dtype=torch.float64, device="cpu")
+        for own, reach in ways:
+            if (value := getattr(reach, name)) is not None:
+                full[own] = all_rows(torch.as_tensor(value, dtype=torch.float64, device="cpu"))
+        numbers[name] = rows(full)
+    several = " and ".join(sorted({reach.way for _, reach in ways}))
+    note = next((reach.note for _, reach in ways if reach.note), "")
+    return Reach(several, ways[0][1].box, *numbers.values(), note)
 
 
 def _local(
@@ -510,17 +527,6 @@ def _periods(seconds: Tensor, period: float) -> Tensor:
 def _settling(decay: Tensor, period: float) -> Tensor:
     """Periods after which the slowest mode, of a decay in 1/s, has fallen to 1e-4."""
     return (_SETTLED / decay / period).ceil()
-
-
-def _by_row(kinds: list[Kind], name: str) -> Tensor:
-    """Return a number of the reaches of all rows; NaN where nobody looked."""
-    found = torch.full((sum(len(kind.rows) for kind in kinds),), math.nan, dtype=torch.float64, device="cpu")
-    for kind in kinds:
-        value = getattr(kind.object.reach, name)
-        if value is not None:
-            full = all_rows(torch.as_tensor(value, dtype=torch.float64, device="cpu"))
-            found[kind.rows] = full[kind.rows] if full.dim() else full
-    return rows(found)  # type: ignore[no-any-return]
 
 
 def _warn_if_slow(policy: NearOptimal) -> None:

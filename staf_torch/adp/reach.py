@@ -36,14 +36,16 @@ _GOOD = 1.02  # mean cost over the best known, beyond which the log warns
 
 
 class Reach(NamedTuple):
-    """The reach of a policy: how many states of a box around its set-point it regulates, and at what cost."""
+    """The reach of a policy: how many states of a box around its set-point it regulates, and at what cost.
+
+    Of rows with numbers of their own three numbers a row, NaN for None."""
 
     way: str  # ``local``: the LQR and its rollouts; ``global``: a memory of optimal trajectories
     box: tuple[float, ...]  # half widths, in units of the state
     regulated: (
         float | Tensor | None
     )  # share of a sample that ends within 1 % of where it began; None: nobody looked
-    over_best: float | None  # mean cost over that of the best trajectories known, of the regulated
+    over_best: float | Tensor | None  # mean cost over that of the best trajectories known, of the regulated
     base: float | Tensor | None  # share that the LQR within its bounds regulates
     note: str = ""  # why nobody looked, or why there is no global value
 

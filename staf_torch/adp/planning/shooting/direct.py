@@ -103,7 +103,8 @@ class DirectShooting:
         high: likewise.
         horizon: T in s; by default so long that the slowest mode of the LQR has fallen to 1e-4, and twice to
             eight times that where the terminal cost is more than 1e-3 of a value. With a horizon a plant
-            needs no LQR, and a cost may be an economic one, with no set-point at all.
+            needs no LQR, and a cost may be an economic one, with no set-point at all. Rows with numbers of
+            their own share a horizon and intervals, by default those of the row that needs most.
         intervals: N, even; by default so many that the fastest mode of the LQR is resolved, 80 without one.
         tolerance: positive, relative.
         iterations: at most, on each mesh; by default 50, or 120 where inputs are bounded.
