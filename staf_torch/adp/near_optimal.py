@@ -395,7 +395,7 @@ def near_optimal(
     which plans all the time, and the policy as a function of x makes a plan anew, in tens of milliseconds,
     where a bound is met; in a loop two ways around that cost nearly the same would take turns.
     **Rows.** With numbers of rows (`staf_torch.rows`) every row has its own policy, horizon and steps of
-    integration; all are made at once, but for rows that need a global value, of which each is learnt by itself.
+    integration. All are made at once, but for rows that need a global value: each is learnt by itself.
 
     A simulator so slow that a control takes more than half of dt is a warning in the log, with the share.
 
