@@ -7,6 +7,7 @@ import pickle
 import random
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,7 +17,7 @@ from torch import Tensor, nn
 from variants import by_turns
 
 import staf_torch as st
-from staf_torch import adp, lanes, optim, systems
+from staf_torch import adp, deploy, lanes, optim, systems
 from staf_torch.lanes.tree import flatten
 
 FEW = 3
@@ -335,6 +336,17 @@ def test_what_does_not_serve_rows_says_so() -> None:
     problem = adp.SampledProblem.of(systems.Linear([[0.0]], [[1.0]]), cost, dt=0.1)
     with pytest.raises(ValueError, match="must have no numbers of a row's own"):
         adp.learn_global_value(problem, [1.0], steps=4)
+
+
+def test_a_controller_goes_to_a_device_row_by_row(tmp_path: Path) -> None:
+    lqr, x = adp.LQR(*problems(2)[0]), starts(2)
+    assert torch.equal(deploy.policy_of(lqr, row=1)(x[1:]), lqr(x)[1:])
+    for export in (
+        lambda: deploy.policy_of(lqr),
+        lambda: deploy.export_learning_c(adp.Feedback(lqr), x[:1], tmp_path / "lqr.h", dt=0.1),
+    ):
+        with pytest.raises(ValueError, match=r"must have no numbers of a row's own .*: name its `row`"):
+            export()
 
 
 def test_a_rule_names_the_first_row_that_breaks_it() -> None:

@@ -19,6 +19,7 @@ from ..lanes.call import Given
 from ..lanes.compiler import run
 from ..lanes.emit.c import commented
 from ..lanes.emit.identifiers import checked_names, guarded
+from ..lanes.row_objects import refuse_rows, row_of
 from ..lanes.trace.graph import WIDE
 from ..lanes.trace.step import trace
 from ..lanes.trace.tracer import NotLoweredError
@@ -86,7 +87,14 @@ def export_c(
 
 @Sign("export to C")
 def export_learning_c(
-    controller: Controller, x0: Tensor, path: Path, *, dt: float, name: str | None = None, note: str = ""
+    controller: Controller,
+    x0: Tensor,
+    path: Path,
+    *,
+    dt: float,
+    name: str | None = None,
+    note: str = "",
+    row: int | None = None,
 ) -> Source:
     """Write a controller that learns: a structure ``NAME_state``, ``NAME_start`` that fills it, and
 
@@ -114,11 +122,14 @@ def export_learning_c(
         dt: s.
         name: as in `export_c`; that of the controller by default.
         note: lines for the comment at its head.
+        row: which one, of a controller with numbers of rows (`staf_torch.rows`).
 
     Raises:
         ValueError: if the controller optimises on the way, the name is taken, or an operation has no C here.
     """
     name = function_name("export_learning_c", name, controller, ["state", "x", "uniform", "u"])
+    controller = controller if row is None else row_of(controller, row)
+    refuse_rows("export_learning_c", "name its `row`", controller=controller)
     check_bounded("export_learning_c", controller)
     controller = in_dtype(controller, x0.dtype)
     carry = controller.init(x0[:1])

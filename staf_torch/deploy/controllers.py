@@ -24,6 +24,7 @@ from ..adp import (
 from ..adp.near_optimal import NearOptimal
 from ..adp.planning.receding_horizon import StrainedPlans
 from ..adp.planning.shooting.optimum import PlanReplay
+from ..lanes.row_objects import refuse_rows, row_of
 from ..local_basis.graded import GradedBasis
 from ..numerics.checks import fail, hold, trailing
 from .remembered import RememberedPolicy
@@ -215,7 +216,10 @@ def foldable(policy: RolloutPolicy) -> bool:
 
 
 def policy_of(
-    controller: Controller | nn.Module, weights: Tensor | None = None, dtype: torch.dtype = torch.float64
+    controller: Controller | nn.Module,
+    weights: Tensor | None = None,
+    dtype: torch.dtype = torch.float64,
+    row: int | None = None,
 ) -> nn.Module:
     """The feedback law u(x) of a controller, as a module with its constants folded where it can be.
 
@@ -232,10 +236,14 @@ def policy_of(
             `GlobalValue`, or any module (..., n) -> (..., m).
         weights: Wa of an actor-critic, (M,); its initial ones by default.
         dtype: of the arithmetic.
+        row: which one, of a controller with numbers of rows (`staf_torch.rows`).
 
     Raises:
-        ValueError: if the controller is none of these, plans on the way, or carries a state.
+        ValueError: if the controller is none of these, has numbers of rows and no row is named, plans on the
+            way, or carries a state.
     """
+    controller = controller if row is None else row_of(controller, row)
+    refuse_rows("policy_of", "name its `row`", controller=controller)
     module = _policy_of(controller, weights).to(dtype)
     if dtype != torch.float64:
         module = in_dtype(module, dtype)  # also of policies that keep their precision

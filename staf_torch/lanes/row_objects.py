@@ -77,11 +77,12 @@ def rows(numbers: Tensor | Sequence[nn.Module]) -> Any:
     return merged(modules)
 
 
-def refuse_rows(call: str, **given: Any) -> None:
+def refuse_rows(call: str, instead: str = "make one for each row", **given: Any) -> None:
     """Refuse objects with numbers of a row's own, of a door that does not serve them.
 
     Args:
         call: the door.
+        instead: what to do.
         given: its arguments by name.
 
     Raises:
@@ -89,8 +90,8 @@ def refuse_rows(call: str, **given: Any) -> None:
     """
     for name, value in given.items() if RowNumbers.made else ():
         if any(isinstance(tensor, RowNumbers) for tensor in Contents(value).tensors):
-            rule = "must have no numbers of a row's own (`staf_torch.rows`), which are not served here yet"
-            raise ValueError(f"`{call}({name}=...)` {rule}: make one for each row.")
+            rule = "must have no numbers of a row's own (`staf_torch.rows`), which are not served here"
+            raise ValueError(f"`{call}({name}=...)` {rule}: {instead}.")
 
 
 def by_rows(function: Callable[Given, Some]) -> Callable[Given, Some]:
@@ -475,6 +476,8 @@ class _Alone(_Merge):
 
 def row_of(value: Some, row: int) -> Some:
     """Return a copy of an object with the numbers of one row alone."""
+    if len(getattr(value, "kinds", ())) and isinstance(kind := getattr(value, "kind", None), RowNumbers):
+        value = value.kinds[int(kind.full[row])]  # type: ignore[attr-defined]
     found: Some = _Alone([torch.tensor([row], dtype=torch.int64, device="cpu")]).of([value], "")
     return found
 
