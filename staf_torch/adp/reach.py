@@ -11,6 +11,8 @@ import torch
 from torch import Tensor
 
 from ..lanes.row_decisions import in_any_row, is_of_rows, of_first, rows_of
+from ..lanes.row_numbers import all_rows
+from ..lanes.row_objects import rows
 from ..numerics.checks import fail
 from ..systems import Bounds, Linear, Plant
 from ..systems.user_plants import FunctionPlant
@@ -74,6 +76,20 @@ def arrived(cost: Cost, x: Tensor, x0: Tensor) -> Tensor:
 def whole(box: Tensor) -> Reach:
     """The reach of an LQR that regulates all of a box by nature."""
     return Reach("local", tuple(box.tolist()), 1.0, None, 1.0)
+
+
+def reach_of_rows(ways: list[tuple[Tensor, Reach]], count: int) -> Reach:
+    """Return the reach of all rows: NaN where nobody looked."""
+    numbers = dict[str, Tensor]()
+    for name in ("regulated", "over_best", "base"):
+        full = torch.full((count,), math.nan, dtype=torch.float64, device="cpu")
+        for own, reach in ways:
+            if (value := getattr(reach, name)) is not None:
+                full[own] = all_rows(torch.as_tensor(value, dtype=torch.float64, device="cpu"))
+        numbers[name] = rows(full)
+    several = " and ".join(sorted({reach.way for _, reach in ways}))
+    note = next((reach.note for _, reach in ways if reach.note), "")
+    return Reach(several, ways[0][1].box, *numbers.values(), note)
 
 
 class Looked(NamedTuple):

@@ -21,7 +21,7 @@ from ..adp import (
     SafetyFilter,
     Supervised,
 )
-from ..adp.near_optimal import NearOptimal
+from ..adp.near_optimal_policy import NearOptimal
 from ..adp.planning.receding_horizon import StrainedPlans
 from ..adp.planning.shooting.optimum import PlanReplay
 from ..lanes.row_objects import refuse_rows, row_of

@@ -142,19 +142,6 @@ def numbers_of_rows(function: Callable[[], tuple[Tensor, ...]], most: int | None
     return NumbersOfRows(found, rows, count)
 
 
-def spread_object(value: Some, rows: Tensor, count: int) -> Some:
-    """Return an object of these rows (R,) as one of all rows: the others have the first's numbers."""
-    place = torch.zeros(count, dtype=torch.int64, device="cpu")
-    place[rows] = torch.arange(len(rows), device="cpu")
-
-    def change(part: Any) -> Any:
-        if not isinstance(part, RowNumbers) or len(part.full) != len(rows):
-            return part
-        return RowNumbers(part.full[place.to(part.full.device)])
-
-    return value if len(rows) == count else _changed(value, change)  # type: ignore[no-any-return]
-
-
 def of_first(tensor: Tensor) -> Tensor:
     """Return the number of the first of many rows, for a message; a tensor of none as it is."""
     values = _values(tensor)
@@ -198,13 +185,13 @@ def _together(function: Callable[[], Any], count: int, rows: Tensor) -> Alike:
         parts = _RowTensors(level := torch._C._functorch.maybe_get_level(index))
         with turn_of(int(rows[0])), resolving(resolve), _Decisions(level):
             result = function()
-        found.extend((parts, _changed(result, parts.take)))
+        found.extend((parts, changed(result, parts.take)))
         return tuple(parts.tensors) or (index,)
 
     columns = torch.func.vmap(one, randomness="same")(rows)
     parts, result = found
     parts.columns = columns
-    return Alike(rows, _changed(result, parts.put))
+    return Alike(rows, changed(result, parts.put))
 
 
 class _Decisions(TorchFunctionMode):
@@ -325,7 +312,7 @@ def _numbers(column: Tensor) -> Tensor:
     return column[0].clone()
 
 
-def _changed(value: Any, change: Callable[[Any], Any], known: dict[int, Any] | None = None) -> Any:
+def changed(value: Any, change: Callable[[Any], Any], known: dict[int, Any] | None = None) -> Any:
     """Return a value in which ``change`` has replaced what it is or holds: objects, containers, closures."""
     known = {} if known is None else known
     new = change(value)
@@ -334,7 +321,7 @@ def _changed(value: Any, change: Callable[[Any], Any], known: dict[int, Any] | N
     if id(value) in known:
         return known[id(value)]
     known[id(value)] = value
-    inside = functools.partial(_changed, change=change, known=known)
+    inside = functools.partial(changed, change=change, known=known)
     if isinstance(value, dict):
         _change_dict(value, inside)
     elif isinstance(value, list):

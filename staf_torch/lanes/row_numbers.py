@@ -257,18 +257,6 @@ def tried(function: Callable[[], Some]) -> tuple[Some | None, int | None]:
     return None, count
 
 
-def rows_of_numbers(numbers: Tensor) -> int:
-    """Return how many rows of numbers serve a batch here."""
-    return 1 if not isinstance(numbers, RowNumbers) else len(columns([numbers], None)[0])
-
-
-def rows_by_kind(kind: Tensor, count: int, kinds: int) -> list[Tensor]:
-    """Return the rows (R,) of every kind, of a batch of ``count`` rows."""
-    assert isinstance(kind, RowNumbers)
-    own = columns([kind], count)[0].cpu()
-    return [(own == k).nonzero().flatten() for k in range(kinds)]
-
-
 def each_row(function: Callable[[], Some], most: int | None = None) -> list[Some]:
     """function() of every row, which sees its own numbers alone; once where it reads no numbers of rows.
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import abc
 import contextlib
-import copy
 import functools
 import inspect
 import sys
@@ -18,16 +17,15 @@ import threading
 import weakref
 from collections.abc import Callable, Sequence
 from types import CellType, FrameType, FunctionType, MethodType
-from typing import Any, NamedTuple, ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from .contents import BOUND, Contents, Derived
-from .loops import where_rows
-from .row_decisions import at_once, is_of_rows, spread_object
+from .row_decisions import at_once, is_of_rows
 from .row_numbers import RowNumbers, all_rows, beside, in_use, over_rows, spread_rows, tried
-from .tree import Shared, flatten, plain
+from .tree import Shared, plain
 
 Some = TypeVar("Some")
 Given = ParamSpec("Given")
@@ -122,63 +120,11 @@ def made_by_rows(make: Callable[[], Some]) -> Some:
         join = getattr(type(objects[0]), "of_kinds", None)
         if join is None:
             raise
-        return join(kinds_of_rows(objects, rows, count))  # type: ignore[no-any-return]
+        return join(objects, rows, count)  # type: ignore[no-any-return]
     if any(isinstance(tensor, RowNumbers) for tensor in Contents(made).tensors):
         return made
     made = merged(objects, rows, beside(make))  # as many rows as there are, although all are alike
     return made
-
-
-class Kind(NamedTuple):
-    """An object of some rows that are alike in all but numbers."""
-
-    rows: Tensor  # (R,)
-    object: Any  # with the numbers of all B rows, of which those of other rows are the first one's
-
-
-def kinds_of_rows(objects: Sequence[Any], rows: Sequence[Tensor], count: int) -> list[Kind]:
-    """Return objects merged where they are alike in all but numbers.
-
-    Args:
-        objects: of one class.
-        rows: of each, (R,).
-        count: B.
-    """
-    groups = list[tuple[list[Any], list[Tensor], Any]]()
-    for one, part in sorted(zip(objects, rows, strict=True), key=lambda pair: int(pair[1][0])):
-        for k, (several, parts, _) in enumerate(groups):
-            with contextlib.suppress(ValueError):
-                joined = _Merge([*parts, part], count).of([*several, one], type(one).__name__)
-                groups[k] = ([*several, one], [*parts, part], joined)
-                break
-        else:
-            groups.append(([one], [part], None))
-    return [
-        Kind(torch.cat(parts), joined if len(parts) > 1 else spread_object(several[0], parts[0], count))
-        for several, parts, joined in groups
-    ]
-
-
-def of_kinds(kinds: Sequence[Kind]) -> Any:
-    """Return a copy of the first kind's module that has all of them as ``kinds``, and as its buffer ``kind``
-    which of them a row is."""
-    first, count = kinds[0].object, sum(len(kind.rows) for kind in kinds)
-    made = object.__new__(type(first))
-    vars(made).update({name: copy.copy(value) for name, value in vars(first).items() if name != BOUND})
-    which = torch.zeros(count, dtype=torch.float64, device="cpu")
-    for k, kind in enumerate(kinds):
-        which[kind.rows] = float(k)
-    made.kinds = nn.ModuleList(kind.object for kind in kinds)
-    made.register_buffer("kind", RowNumbers(which))
-    return made
-
-
-def whichever(kind: Tensor, bodies: Sequence[Callable[[Any], Any]], given: Any, like: Any) -> Any:
-    """Return what the function of a row's kind returns: trees (B, ...) to (B, ...), in place of ``like``."""
-    count = len(flatten(given)[0][0])
-    for k, body in enumerate(bodies):
-        like = where_rows((kind == k).expand(count), body, given, like)
-    return like
 
 
 class Note(str):
@@ -324,13 +270,13 @@ def merged(objects: Sequence[Some], rows: Sequence[Tensor] | None = None, other:
     rows, values = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
     if other is not None:
         with contextlib.suppress(ValueError):  # it may differ in more
-            found: Some = _Merge(rows).of([*values, other], type(other).__name__)
+            found: Some = Merge(rows).of([*values, other], type(other).__name__)
             return found
-    made: Some = _Merge(rows).of(values, type(values[0]).__name__)
+    made: Some = Merge(rows).of(values, type(values[0]).__name__)
     return made
 
 
-class _Merge:
+class Merge:
     """Merges objects, each with the numbers of these rows; one more may say which numbers are of rows."""
 
     def __init__(self, rows: Sequence[Tensor], count: int | None = None) -> None:
@@ -458,7 +404,7 @@ class _Merge:
         )
 
 
-class _Alone(_Merge):
+class _Alone(Merge):
     """Copies an object of many rows with the numbers of one."""
 
     def of(self, values: list[Any], name: str) -> Any:

@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from .. import adp
 from ..adp import LQR, Controller, Cost, Feedback, ValueBasis
 from ..adp.loop.setup import AdpProblem, OptimumSettings
-from ..adp.near_optimal import NearOptimal
+from ..adp.near_optimal_policy import NearOptimal
 from ..adp.safety.safety_filter import walls
 from ..approximation.basis import StaFBasis
 from ..numerics.checks import COMMAND_LINE, choice, fail, flag, integer, positive_real

@@ -15,7 +15,7 @@ from torch import Tensor
 
 import staf_torch as st
 from staf_torch import adp, deploy, lanes, systems
-from staf_torch.adp.near_optimal import NearOptimal
+from staf_torch.adp.near_optimal_policy import NearOptimal
 from staf_torch.adp.policies.sampled_rollout import SampledRollout
 from staf_torch.deploy.c_header import runner_c
 

@@ -14,7 +14,7 @@ from helpers_swingup import GRID, RESETS
 from torch import Tensor
 
 from staf_torch import adp, deploy, lanes, systems
-from staf_torch.adp.near_optimal import NearOptimal
+from staf_torch.adp.near_optimal_policy import NearOptimal
 
 
 def turn(x: Tensor, u: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from ...lanes import compiled, repeat, where_rows
 from ...lanes.gradients import gradients_of, marked
 from ...lanes.one_thread import small
 from ...lanes.row_decisions import of_first
-from ...lanes.row_objects import Kind, of_kinds, whichever
+from ...lanes.row_kinds import kinds_of_rows, of_kinds, whichever
 from ...numerics.checks import fail, one_or_each, positive, positive_real, trailing
 from ...numerics.default_device import beside, device_of
 from ...numerics.shown import limits, shown
@@ -201,8 +201,15 @@ class SafetyFilter(Controller):
                 _log.warning(_OPPOSED, k, float(of_first(rate)), _FOLLOWS if self.follows else _TOPPLES)
 
     @classmethod
-    def of_kinds(cls, kinds: list[Kind]) -> SafetyFilter:
-        """Return the filter of rows that are of several kinds, as their constraints and brakes are."""
+    def of_kinds(cls, filters: Sequence[SafetyFilter], rows: Sequence[Tensor], count: int) -> SafetyFilter:
+        """Return the filter of rows that are of several kinds, as their constraints and brakes are.
+
+        Args:
+            filters: of some rows each.
+            rows: of each, (R,).
+            count: B.
+        """
+        kinds = kinds_of_rows(filters, rows, count)
         made: SafetyFilter = of_kinds(kinds)
         for name in ("moving", "follows", "opposed"):
             setattr(made, name, any(getattr(each, name) for each in made.kinds))
