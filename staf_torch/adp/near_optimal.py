@@ -159,7 +159,7 @@ def near_optimal(
         ways.append((own, alone.reach))
     made = kinds[0].object if len(kinds) == 1 and kept else NearOptimal.of_kinds(kinds)
     made.reach = reach_of_rows(ways, count)
-    return made  # type: ignore[no-any-return]
+    return made
 
 
 def _local(

@@ -134,7 +134,8 @@ class NearOptimal(SampledRollout):
         which carries its plan all the time, the first one the best of several. With a global value the
         policy alone. Rows with numbers of their own plan as far as the slowest of them needs."""
         if len(self.kinds):
-            return ControllerOfKinds([each.controller() for each in self.kinds], self.get_buffer("kind"))
+            kinds: list[Any] = list(self.kinds)
+            return ControllerOfKinds([each.controller() for each in kinds], self.get_buffer("kind"))
         if self.memory is not None:
             return Feedback(self)
         if (planner := self.planner) is not None:

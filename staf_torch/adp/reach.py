@@ -80,16 +80,18 @@ def whole(box: Tensor) -> Reach:
 
 def reach_of_rows(ways: list[tuple[Tensor, Reach]], count: int) -> Reach:
     """Return the reach of all rows: NaN where nobody looked."""
-    numbers = dict[str, Tensor]()
-    for name in ("regulated", "over_best", "base"):
+
+    def numbers(name: str) -> Tensor:
         full = torch.full((count,), math.nan, dtype=torch.float64, device="cpu")
         for own, reach in ways:
             if (value := getattr(reach, name)) is not None:
                 full[own] = all_rows(torch.as_tensor(value, dtype=torch.float64, device="cpu"))
-        numbers[name] = rows(full)
+        return rows(full)  # type: ignore[no-any-return]
+
     several = " and ".join(sorted({reach.way for _, reach in ways}))
     note = next((reach.note for _, reach in ways if reach.note), "")
-    return Reach(several, ways[0][1].box, *numbers.values(), note)
+    box = ways[0][1].box
+    return Reach(several, box, numbers("regulated"), numbers("over_best"), numbers("base"), note)
 
 
 class Looked(NamedTuple):
@@ -146,8 +148,10 @@ def extended(
     """
     cost, x0, widths = policy.cost, sample(policy.cost, box), tuple(box.tolist())
     found = looked(policy, lqr, box, torch.tensor(float(settles), dtype=torch.float64), way)
-    if found is None or found.reach is not None:
-        return (whole(box) if found is None else found.reach), None
+    if found is None:
+        return whole(box), None
+    if found.reach is not None:
+        return found.reach, None
     base, share = found.base, float(found.share)
     try:
         problem = sampled_problem(policy.plant, cost, policy.period, x0)

@@ -181,24 +181,26 @@ class ControllerOfKinds(Controller):
     def __init__(self, kinds: Sequence[Controller], kind: Tensor) -> None:
         super().__init__()
         self.kinds, self.kind = nn.ModuleList(kinds), kind
+        self._each = list(kinds)
         self.draws, self.period = max(each.draws for each in kinds), kinds[0].period
         self.work = max(each.work for each in kinds)
 
     @property
     def label(self) -> str:
-        return str(self.kinds[0].label)
+        return self._each[0].label
 
     def init(self, x0: Tensor) -> Carried:
-        return tuple(each.init(x0) for each in self.kinds)
+        return tuple(each.init(x0) for each in self._each)
 
     def step(self, x: Tensor, carried: Carried, uniform: Tensor, dt: float) -> tuple[Tensor, Carried]:
-        u, after = self.kinds[0].step(x, carried[0], uniform, dt)
+        u, after = self._each[0].step(x, carried[0], uniform, dt)
         ends = [after]
-        for k, each in enumerate([*self.kinds][1:], 1):
+        for k, each in enumerate(self._each[1:], 1):
             given = x, carried[k], uniform
 
-            def own(now: Any, each: Controller = each) -> tuple[Tensor, Carried]:
-                return each.step(*now, dt)
+            def own(now: tuple[Tensor, Carried, Tensor], each: Controller = each) -> tuple[Tensor, Carried]:
+                x, carried, uniform = now
+                return each.step(x, carried, uniform, dt)
 
             u, after = where_rows((self.kind == k).expand(len(x)), own, given, (u, carried[k]))
             ends.append(after)

@@ -112,7 +112,7 @@ class Holding:
         self.table: ExponentialStep | None = None
         self.curvature: Tensor | None = None  # of the cost, with a table
         self.discount = 0.0 if cost is None else cost.discount
-        self.error: float | Tensor | None = None
+        self.error: float | None = None
         if plant.period is not None:
             self.least = self.steps = periods(call, plant, dt)
         elif substeps is None:
@@ -315,7 +315,7 @@ class Holding:
             if not cheaper and bool(dear.error < found.error):
                 found, self.table = dear, self._with(dear.number, linear).table
         self.least = self.steps = found.number
-        self.error = found.error if is_of_rows(found.error) else float(found.error)
+        self.error = found.error if is_of_rows(found.error) else float(found.error)  # type: ignore[assignment]
         if not bool(
             found.error <= (_OUTSIDE if found.number == 1 and self.table is None else GRACE) * TOLERANCE
         ):

@@ -352,7 +352,8 @@ class SafetyFilter(Controller):
         flat = z.reshape(-1, z.shape[-1])
         if len(self.kinds):
             none = flat.new_zeros(len(flat), m + len(self.constraints) + 2)
-            found = whichever(self.get_buffer("kind"), [each.nearest for each in self.kinds], flat, none)
+            kinds: list[Any] = list(self.kinds)
+            found: Tensor = whichever(self.get_buffer("kind"), [each.nearest for each in kinds], flat, none)
             return found.reshape(*z.shape[:-1], -1)[..., : none.shape[-1] - 1 + self.opposed]
         x, wanted, t = flat[:, :n], flat[:, n : n + m], flat[:, n + m]
         low, high = self.bounds.low.to(x), self.bounds.high.to(x)

@@ -275,9 +275,8 @@ def replay(
     if x0.dim() == 2:
         return over_rows(again, x0, *given, offset)
 
-    def rows_first(x0: Tensor, *given: Tensor) -> MeshPlan:
-        *same, offset = given
-        return _swapped(again(x0.transpose(0, 1), *same, offset.transpose(0, 1)))
+    def rows_first(x0: Tensor, state: Tensor, planned: Tensor, feedback: Tensor, offset: Tensor) -> MeshPlan:
+        return _swapped(again(x0.transpose(0, 1), state, planned, feedback, offset.transpose(0, 1)))
 
     return _swapped(over_rows(rows_first, x0.transpose(0, 1), *given, offset.transpose(0, 1)))
 
