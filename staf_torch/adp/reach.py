@@ -147,7 +147,9 @@ def extended(
         ValueError: if the way is ``global`` and there is no global value.
     """
     cost, x0, widths = policy.cost, sample(policy.cost, box), tuple(box.tolist())
-    found = looked(policy, lqr, box, torch.tensor(float(settles), dtype=torch.float64), way)
+    found = looked(
+        policy, lqr, box, torch.tensor(float(settles), dtype=torch.float64, device=box.device), way
+    )
     if found is None:
         return whole(box), None
     if found.reach is not None:
