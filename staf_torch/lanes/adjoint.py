@@ -24,6 +24,7 @@ from .tree import Shared, flatten, plain, unflatten
 
 if TYPE_CHECKING:
     from .program import Built, Program
+    from .trace.captured_tensors import TableSlopes
 
 _WORTH = 10  # operations of a step for each byte of its carry: kept, it costs less than the step again
 Plan = PlannedCall | DeviceCall
@@ -73,6 +74,7 @@ class Ran(NamedTuple):
         order: what the step reads, in an order that all processes share.
         found: places of the captured tensors with a gradient among those that the trace found.
         captured: these tensors.
+        read: all that the trace found.
         numbers: of rows that the step reads.
         versions: of what the step reads and has no gradient.
         kept: whether the forward pass keeps the carries.
@@ -86,6 +88,7 @@ class Ran(NamedTuple):
     order: dict[int, int]
     found: tuple[int, ...]
     captured: tuple[Tensor, ...]
+    read: tuple[Tensor, ...]
     numbers: tuple[RowNumbers, ...]
     versions: tuple[tuple[Tensor, int], ...]
     kept: bool
@@ -104,6 +107,7 @@ class GradientCall:
 
     Attributes:
         sizes: how many inputs a row has once, how many come at every time, and how many are the carry.
+        tables: what the latest backward pass used of the table.
     """
 
     def __init__(self, program: Program, given: Given, every: int) -> None:
@@ -112,6 +116,7 @@ class GradientCall:
         self.sizes = len(given.row), len(given.now), len(given.carry)
         self._shared = [isinstance(leaf, Shared) for leaf in (*given.row, *given.now, *given.carry)]
         self._plans: dict[Any, tuple[Compiled, Plan]] = {}
+        self.tables: dict[Any, TableSlopes] = {}
         self._refused = False
         self.deciding, self.needed = program.deciding, program.needed
 
@@ -147,6 +152,7 @@ class GradientCall:
             order={id(tensor): k for k, tensor in enumerate(keeping.reads())},
             found=found,
             captured=tuple(read[k] for k in found),
+            read=tuple(read),
             numbers=built.compiled.rows,
             versions=tuple((tensor, tensor._version) for tensor in fixed),
             kept=pays and self.every == 1 and size * self.rows * self.times <= _budget,

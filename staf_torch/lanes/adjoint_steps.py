@@ -7,6 +7,7 @@ it, another stands in its place.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -17,7 +18,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from .call import Given
 from .row_numbers import RowNumbers
-from .trace.step import Step
+from .trace.reversed_program import reversed_program
+from .trace.step import Step, Traced, trace
 from .trace.tracer import NotLoweredError
 from .tree import Shared, Tree, flatten, plain, unflatten
 
@@ -98,38 +100,157 @@ def adjoint_step(
     return adjoint
 
 
-def deciding(step: Step, given: Given, ends: Sequence[bool], outputs: Sequence[bool]) -> tuple[bool, ...]:
-    """Return which leaves of the carry decide, now or later, what has a gradient: through no others one goes.
+class ReversedStep:
+    """The step of `adjoint_step` as the reverse of the numbers of a step, where torch's conventions allow it.
 
-    Found out by a step in plain torch, in which loops take all of their passes.
+    Args:
+        step: of a program.
+        given: one row and one time of it.
+        wanted: for which there are gradients.
+        numbers: of its table that have some: where each run of them begins, and its length.
+    """
+
+    def __init__(
+        self, step: Step, given: Given, wanted: Differentiated, numbers: tuple[tuple[int, int], ...]
+    ) -> None:
+        self._step, self._given, self._wanted, self._numbers = step, given, wanted, numbers
+
+    def __call__(self, carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
+        raise NotLoweredError("an adjoint that is no function of torch")
+
+    def traced(self, given: Given, *, widened: bool = False) -> Traced:
+        """Return the program, for inputs like these."""
+        one = trace(self._step, self._given, widened=widened)
+        program = reversed_program(one.program, self._wanted, self._numbers, len(self._given.row))
+        brought = given.now[len(self._given.carry) :]
+        slopes = [leaf for leaf, chosen in zip(brought, self._wanted.now, strict=False) if chosen]
+        forms = [
+            (x.tensor.shape[1:], x.tensor.dtype) if isinstance(x, Shared) else (x.shape[2:], x.dtype)
+            for x in slopes
+        ]
+        return one._replace(program=program, outputs=tuple(forms), structure=flatten(tuple(slopes))[1])
+
+
+class Deciding(NamedTuple):
+    """What an adjoint depends on.
+
+    Args:
+        carry: which leaves of the carry decide, now or later, what has a gradient: all goes through them.
+        usual: whether what makes it of a row are operations of which `trace.reverse` has torch's derivative.
+    """
+
+    carry: tuple[bool, ...]
+    usual: bool
+
+
+def deciding(
+    step: Step, given: Given, own: Sequence[Tensor], ends: Sequence[bool], outputs: Sequence[bool]
+) -> Deciding:
+    """Find out what an adjoint depends on by a step in plain torch, with all passes of loops.
 
     Args:
         step: of a program.
         given: one row and one time.
+        own: numbers of rows that stand in it.
         ends: which leaves of the last carry have a gradient.
         outputs: which outputs have one.
     """
-    moves = [leaf.is_floating_point() for leaf in given.carry]
-    leaves = [x.detach().requires_grad_(real) for x, real in zip(given.carry, moves, strict=True)]
-    now = [plain(x)[0] if isinstance(x, Shared) else x[:, 0] for x in given.now]
-    with torch.enable_grad(), _Seen():  # type: ignore[no-untyped-call]
-        after, out = step(
-            given.tree("carry", leaves), given.tree("now", now), given.tree("row", [*map(plain, given.row)])
-        )
+
+    def leaf(x: Tensor) -> Tensor:
+        return x.detach().requires_grad_(x.is_floating_point())
+
+    leaves = [*map(leaf, given.carry)]
+    now = [leaf(plain(x)[0] if isinstance(x, Shared) else x[:, 0]) for x in given.now]
+    row = [leaf(plain(x)) for x in given.row]
+    with torch.enable_grad(), _Seen(), _Cut() as cut:  # type: ignore[no-untyped-call]
+        after, out = step(given.tree("carry", leaves), given.tree("now", now), given.tree("row", row))
     following, made = flatten(after)[0], flatten(out)[0]
+    moves = [x.requires_grad for x in leaves]
     real = [leaf for leaf in leaves if leaf.requires_grad]
     alive = [end and moving for end, moving in zip(ends, moves, strict=True)]
     while True:
         roots = [x for x, one in zip((*following, *made), (*alive, *outputs), strict=True) if one]
         with torch.enable_grad():  # of sums: beside gradients of another shape torch imports SymPy
             sums = [root.sum() for root in roots if root.requires_grad]
-        slopes = torch.autograd.grad(sums, real, retain_graph=True, allow_unused=True) if sums else ()
+        slopes = (
+            torch.autograd.grad(sums, real, retain_graph=True, allow_unused=True) if sums and real else ()
+        )
         met = iter([slope is not None for slope in slopes] or [False] * len(real))
         reached = [moving and next(met) for moving in moves]
         more = [one or found for one, found in zip(alive, reached, strict=True)]
         if more == alive:
-            return tuple(alive)
+            break
         alive = more
+    return Deciding(tuple(alive), not cut.met and _usual(roots, [*leaves, *now, *row, *own]))
+
+
+def _usual(roots: Sequence[Tensor], leaves: Sequence[Tensor]) -> bool:
+    """Return whether operations on a row are among `_USUAL`, and others torch's own."""
+    own = {id(x) for x in leaves}
+    waiting = [x.grad_fn or torch.autograd.graph.get_gradient_edge(x).node for x in roots if x.requires_grad]
+    above: dict[Any, list[Any]] = {node: [] for node in waiting}
+    rows = []
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, torch.autograd.function.BackwardCFunction):
+            return False
+        if id(getattr(node, "variable", None)) in own:
+            rows.append(node)
+        for below, _ in node.next_functions:
+            if below is not None:
+                if below not in above:
+                    above[below] = []
+                    waiting.append(below)
+                above[below].append(node)
+    seen, own_nodes = set(rows), frozenset(rows)
+    while rows:
+        for node in above[rows.pop()]:
+            if node in seen:
+                continue
+            seen.add(node)
+            rows.append(node)
+    for node in seen.difference(own_nodes):
+        name = _BACKWARD.sub("", node.name())
+        power = getattr(node, "_saved_exponent", 1) if name == "Pow" else 1
+        if name not in _USUAL or isinstance(power, Tensor) or (power < 1 and power != 0.5):
+            return False
+        factor = node.next_functions[1][0] if name == "CholeskySolve" else None
+        if factor is not None and (factor in seen or _BACKWARD.sub("", factor.name()) not in _LOWER):
+            return False  # torch has slopes above the diagonal, which nobody reads
+    return True
+
+
+_LOWER = ("LinalgCholeskyEx", "Tril")
+_BACKWARD = re.compile(r"(Backward)+s?\d*$")
+_NAMES = """Add Sub Rsub Mul Div Neg Exp Expm1 Log Log1P Sin Cos Tan Tanh Sqrt Rsqrt Reciprocal Pow
+    Abs Where MaskedFill Sum Mean Cumsum Mm Bmm Addmm Baddbmm Mv Dot CholeskySolve
+    LinalgSolveTriangular View ReshapeAlias UnsafeView Expand Permute Transpose T Squeeze Unsqueeze
+    Select Slice Unbind Split SplitWithSizes Cat Stack Index IndexSelect IndexPut IndexPutImpl
+    Gather ConstantPadNd Diagonal DiagEmbed Flip Roll Repeat Unfold Clone ToCopy Alias Copy
+    CopySlices Fill Tril Triu"""
+_USUAL = frozenset(_NAMES.split())
+"""Operations, as autograd calls them, that have torch's derivative where they are single numbers."""
+
+
+class _Cut(TorchFunctionMode):
+    """Context that notes whether something cuts a derivative that goes through other operations.
+
+    Attributes:
+        met: whether it was so.
+    """
+
+    met = False
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        name = getattr(func, "__name__", "")
+        off = name.endswith("set_grad_enabled") and not args[0]
+        self.met = self.met or off or name in ("detach", "detach_") or func == _DATA
+        return func(*args, **kwargs or {})
+
+
+_DATA = Tensor.data.__get__  # type: ignore[attr-defined]
 
 
 class _Seen(TorchDispatchMode):

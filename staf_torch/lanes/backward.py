@@ -9,15 +9,16 @@ the order depends on the number of rows alone.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from .adjoint_steps import Differentiated, Substituted, adjoint_step, deciding
+from .adjoint_steps import Deciding, Differentiated, ReversedStep, Substituted, adjoint_step, deciding
 from .call import Given, fresh, inner_strides
 from .row_independence import undrawn
+from .trace.captured_tensors import TableSlopes
 from .trace.step import Step
 from .tree import Shared, flatten, plain
 
@@ -55,8 +56,9 @@ class Backward:
         self._of_captured = [k for k, need in enumerate(of_captured) if need]
         self._of_own = [k for k, need in enumerate(of_own) if need]
         self._end, self._ends = [*ends[: call.sizes[2]]], [*ends[call.sizes[2] :]]
+        carry, usual = self._deciding()
         self._form = Differentiated(
-            carry=self._deciding(),
+            carry=carry,
             now=tuple(self._of_now),
             shared=tuple(isinstance(leaf, Shared) for leaf in self._now),
             row=tuple(self._of_row),
@@ -68,15 +70,18 @@ class Backward:
         summed = [
             (plain(x), isinstance(x, Shared)) for x, w in zip(self._row, self._of_row, strict=True) if w
         ]
-        summed += [(self._captured[k], True) for k in self._of_captured]
-        self._summed = [*summed, *((self._own[k], False) for k in self._of_own)]
-        self._structures: dict[str, Any] = {}
-        few = slice(0, min(call.rows, _UNIT))
-        begin = [leaf[few] for leaf in self._carry]
-        given = self._given(few, slice(0, 1), self._slopes(few), [leaf.unsqueeze(1) for leaf in begin], None)
-        self._on_processor = given.ordinary() is True
-        program = call.program.follower(("adjoint", self._form), self._step, follows=ran.built.followed)
-        self.built = program.built(given)
+        own = [(self._own[k], False) for k in self._of_own]
+        self._table = self._slopes_of_table() if usual else None
+        self._runs = None if self._table is None else self._table.runs
+        self._summed: list[tuple[Tensor, bool]] = []
+        if self._runs is not None:
+            like = torch.empty(0, dtype=ran.built.compiled.real, device="cpu")
+            self._summed = [*summed, *((like.new_empty(size), True) for _, size in self._runs), *own]
+            self._build()
+            self._runs = None if self.built is None else self._runs
+        if self._runs is None:
+            self._summed = [*summed, *((self._captured[k], True) for k in self._of_captured), *own]
+            self._build()
         # Leaves of the carry that the adjoint reads: what comes at a time begins with them.
         times = () if self.built is None else self.built.trace.times
         self._needed = {k for k in times if k < len(self._carry)}
@@ -86,26 +91,57 @@ class Backward:
         places = {id(numbers): k for k, numbers in enumerate(ran.numbers)}
         self._read = [self._own[places[id(numbers)]] for numbers in used]
 
-    def _deciding(self) -> tuple[bool, ...]:
-        """Which leaves of the carry decide what has a gradient."""
+    def _slopes_of_table(self) -> TableSlopes | None:
+        """What finds slopes by captured tensors from those by numbers of the table; None without."""
+        trace, wanted = self._ran.built.trace, tuple(self._ran.found[k] for k in self._of_captured)
+        known = self._call.tables.get((id(trace.recipe.operations), wanted))
+        if known is None and trace.recipe.repeats:
+            known = TableSlopes(trace.recipe, [trace.recipe.found[k] for k in wanted])
+            self._call.tables = {(id(trace.recipe.operations), wanted): known}  # keeps these alive
+        return known
+
+    def _build(self) -> None:
+        """Build the adjoint: of single numbers, or by `torch.func.vjp`."""
+        call, ran, runs = self._call, self._ran, self._runs
+        self._structures: dict[str, Any] = {}
+        few = slice(0, min(call.rows, _UNIT))
+        begin = [leaf[few] for leaf in self._carry]
+        given = self._given(few, slice(0, 1), self._slopes(few), [leaf.unsqueeze(1) for leaf in begin], None)
+        self._on_processor = given.ordinary() is True
+        kind = ("adjoint" if runs is None else "reverse"), self._form, *(runs or ())
+        program = call.program.follower(kind, self._step, follows=ran.built.followed)
+        self.built = program.built(given)
+
+    def _deciding(self) -> Deciding:
+        """What the adjoint depends on."""
         ends, outputs = ([end is not None for end in each] for each in (self._end, self._ends))
         known = self._call.deciding.get((*ends, *outputs))
         if known is None:
-            row = self._some(self._row, slice(0, 1), None)
-            now = self._some(self._now, slice(0, 1), slice(0, 1))
-            given = Given([x[:1] for x in self._carry], now, row, self._call.structures, 1, 1)
             try:
-                own = {id(n): x[0] for n, x in zip(self._ran.numbers, self._own, strict=True)}
-                with Substituted(own), undrawn():
-                    known = deciding(self._call.program.step, given, ends, outputs)
+                own = [x[0].detach().requires_grad_(x.is_floating_point()) for x in self._own]
+                others: dict[int, Tensor] = dict(zip(map(id, self._ran.numbers), own, strict=True))
+                with Substituted(others), undrawn():
+                    known = deciding(self._call.program.step, self._one(), own, ends, outputs)
             except Exception:  # of a step that is tried otherwise than it runs
-                known = tuple(dtype.is_floating_point for _, dtype in self._ran.built.compiled.carry)
+                forms = self._ran.built.compiled.carry
+                known = Deciding(tuple(dtype.is_floating_point for _, dtype in forms), usual=False)
             self._call.deciding[(*ends, *outputs)] = known
         return known
+
+    def _one(self) -> Given:
+        """Return one row and one time."""
+        row = self._some(self._row, slice(0, 1), None)
+        now = self._some(self._now, slice(0, 1), slice(0, 1))
+        return Given([x[:1] for x in self._carry], now, row, self._call.structures, 1, 1)
 
     def _step(self, program: Program) -> Step:
         """Return the adjoint of a program's step: of the call's, or of that which it follows."""
         trace = self._ran.built.trace
+        if self._runs is not None:
+            one = self._one()
+            carry, now, row = ([_copied(x) for x in part] for part in (one.carry, one.now, one.row))
+            given = Given(carry, now, row, one.structures, 1, 1)
+            return ReversedStep(program.step, given, self._form, tuple(self._runs))
         found = [program.in_place_of(trace.recipe.found[self._ran.found[k]]) for k in self._of_captured]
         numbers = [program.in_place_of(trace.rows[k]) for k in self._of_own]
         return adjoint_step(program.step, self._call.structures, self._form, found, numbers)
@@ -149,8 +185,15 @@ class Backward:
         now = [next(times) if need else None for need in self._of_now]
         each = [next(carries) if decides else None for decides in self._form.carry]
         carry = [x if need else None for x, need in zip(each, self._of_carry, strict=True)]
-        captured = [next(totals) if k in self._of_captured else None for k in range(len(self._captured))]
+        of_captured = iter(self._by_captured(totals))
+        captured = [next(of_captured) if k in self._of_captured else None for k in range(len(self._captured))]
         return [*row, *now, *carry, *captured, *self._numbers(totals)]
+
+    def _by_captured(self, totals: Iterator[Tensor]) -> list[Tensor]:
+        """Gradients by captured tensors, through the numbers of the table that follow from them."""
+        if self._runs is None or self._table is None:
+            return [next(totals) for _ in self._of_captured]
+        return self._table(self._ran.read, [next(totals) for _ in self._runs])
 
     def _numbers(self, totals: Any) -> list[Tensor | None]:
         return [next(totals) if k in self._of_own else None for k in range(len(self._own))]
@@ -255,8 +298,10 @@ class Backward:
             shapes = [x.shape if shared else x.shape[1:] for x, shared in self._summed]
             sums = [torch.zeros((count, *shape), dtype=real, device=self._device) for shape in shapes]
         ends = [self._at(end, rows, times) for end in self._ends if end is not None]
-        captured = [Shared(self._captured[k]) for k in self._of_captured]
-        own = [self._own[k][rows] for k in self._of_own]
+        captured, own = list[Shared](), list[Tensor]()
+        if self._runs is None:
+            captured = [Shared(self._captured[k]) for k in self._of_captured]
+            own = [self._own[k][rows] for k in self._of_own]
         carry = [*slopes], [*sums]
         now = [*before], self._some(self._now, rows, times), ends
         row = self._some(self._row, rows, None), captured, own
@@ -343,6 +388,11 @@ def some_rows(given: Given, rows: slice) -> Given:
     row, now = ([x if isinstance(x, Shared) else x[rows] for x in part] for part in (given.row, given.now))
     carry = [x[rows] for x in given.carry]
     return Given(carry, now, row, given.structures, rows.stop - rows.start, given.times)
+
+
+def _copied(leaf: Any) -> Any:
+    """Return an input with memory of its own."""
+    return Shared(leaf.tensor.clone()) if isinstance(leaf, Shared) else leaf.clone()
 
 
 def _units(x: Tensor) -> Tensor:

@@ -387,7 +387,7 @@ def _loop(
         loop.following += _whole(tracer, end) if large else tracer.nodes(end).reshape(-1).tolist()
     out_leaves, out_structure = flatten(outputs)
     loop.collected = [tracer.nodes(leaf).reshape(-1).tolist() for leaf in out_leaves]
-    _place(tracer, loop, number)
+    graph.close(number)
     results, done = [], 0
     for leaf in given:
         nodes = _numbers(tracer, "result", (loop.node,), (number, done), leaf, None)
@@ -448,19 +448,3 @@ def _collected(tracer: Tracer, leaf: Tensor, dim: int, loop: Loop, number: int, 
     nodes: Ids = tracer.entries(array, kind, loop.count * leaf.numel()).reshape(loop.count, *leaf.shape)
     whole = torch.stack([leaf.detach()] * loop.count, dim=dim)
     return tracer.attach(whole.contiguous(), np.moveaxis(nodes, 0, dim))
-
-
-def _place(tracer: Tracer, loop: Loop, number: int) -> None:
-    """Return the loop's place: as far outside as its inputs allow."""
-    graph = tracer.graph
-    ends = [*loop.following, *(node for part in loop.collected for node in part), *loop.condition]
-    free, seen, stack = set(loop.initial), set(), ends
-    while stack:
-        node = stack.pop()
-        if graph.depth[node] < loop.depth:
-            free.add(node)
-        elif node not in seen:
-            seen.add(node)
-            stack += graph.args[node]
-    loop.home = max((graph.depth[node] for node in free), default=0)
-    loop.node = graph.add("loop", sorted(free), "none", number, loop.home)

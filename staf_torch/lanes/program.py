@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..signs import Sign
 from . import cache
-from .adjoint_steps import keeping_step
+from .adjoint_steps import Deciding, keeping_step
 from .cache import Trace
 from .call import Compiled, Given, form, ordinary, served
 from .compiler import machine_code
@@ -28,6 +28,7 @@ from .row_independence import doubt, undrawn
 from .row_numbers import RowNumbers, over_rows, points_of_rows
 from .texts import Form, kernel, written
 from .trace.step import Step, trace
+from .trace.step_copy import NoReverseError
 from .trace.tracer import NotLoweredError
 from .tree import Shared, Tree, flatten, labels, plain, unflatten
 
@@ -79,7 +80,7 @@ class Program(Derived):
         self._model: tuple[Program, Mapping[int, Tensor]] | None = None
         self._builds = False  # whether that is built first, if it was not
         self._followers: dict[Hashable, Program] = {}  # of steps that are made from this one
-        self.deciding: dict[Hashable, tuple[bool, ...]] = {}  # leaves of the carry, by what has a gradient
+        self.deciding: dict[Hashable, Deciding] = {}  # by what has a gradient
         self.needed = set[int]()  # leaves of the carry that an adjoint reads, once there was one
         self._tensors: Sequence[Tensor] = ()  # that the step reads, as far as is known
         self._described: tuple[bytes, Sequence[Tensor]] | None = None
@@ -434,6 +435,8 @@ class Program(Derived):
                 return None
             source = made.text.source
             call: Any = machine_code(source) if isinstance(form, int) else source
+        except NoReverseError:  # there is another form
+            return None
         except (NotLoweredError, OSError) as error:
             say(self.name, str(error), "no build" if isinstance(error, OSError) else None)
             return None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 
+from .adjoint_steps import ReversedStep
 from .cache import Trace
 from .call import Given
 from .emit.cpp import emit
@@ -20,20 +21,28 @@ Form = int | torch.device
 def written(step: Step, given: Given, form: Form) -> Trace:
     real = given.real
     if not isinstance(form, int):
-        traced = trace(step, given)
+        traced = _traced(step, given)
         text = kernel(traced, given)
         return _record(text, traced, real)
     try:
-        traced = trace(step, given)
+        traced = _traced(step, given)
         text = emit(*traced.program, form)
     except NotLoweredError:
         if real == torch.float64:
             raise
         # float64 within a program of float32: all of it in double, rounded where it ends.
         real = torch.float64
-        traced = trace(step, given, widened=True)
+        traced = _traced(step, given, widened=True)
         text = emit(*traced.program, form)
     return _record(text, traced, real)
+
+
+def _traced(step: Step, given: Given, *, widened: bool = False) -> Traced:
+    return (
+        step.traced(given, widened=widened)
+        if isinstance(step, ReversedStep)
+        else trace(step, given, widened=widened)
+    )
 
 
 def _record(text: Text, traced: Traced, real: torch.dtype) -> Trace:

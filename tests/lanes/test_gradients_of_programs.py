@@ -192,3 +192,40 @@ def test_a_budget_that_is_none_is_refused() -> None:
     told = r"gradient_memory\(mebibytes=...\)` must be positive; got 0"
     with pytest.raises(ValueError, match=told), lanes.gradient_memory(0):
         pass
+
+
+LARGE, FEW = nn.Parameter(0.3 * drawn(12, 12)), nn.Parameter(drawn(5, 12))
+
+
+def loops(x: Tensor, _: Tree, __: Tree) -> tuple[Tensor, Tensor]:
+    """Loops that stay loops, one in another, with arrays and numbers of outside; a captured factor."""
+    x = lanes.repeat(4, lambda y: y - 0.1 * GAIN * (y @ LARGE.mT), x, where=lambda y: y[:, 0] < 0.5)
+    _, found = lanes.scan(lambda s, p: (0.9 * s + p.sin(), s * p), x, x.unsqueeze(1) + FEW)
+    gram = (-(MATRIX.mT.unsqueeze(1) - MATRIX.mT).square().sum(-1)).exp() + torch.eye(3, dtype=x.dtype)
+    weights = torch.cholesky_solve(x[:, :3].unsqueeze(-1), torch.linalg.cholesky(gram)).squeeze(-1)
+    inner = lanes.repeat(
+        2, lambda y: y + 0.1 * lanes.repeat(2, lambda z: z.cos() * GAIN + weights, y), weights
+    )
+    return 0.5 * x + 0.01 * found.sum(1) + inner.sum(-1, keepdim=True), inner
+
+
+def cut(x: Tensor, _: Tree, __: Tree) -> tuple[Tensor, Tensor]:
+    with torch.no_grad():
+        held = x.sin() * GAIN
+    return GAIN * x + held, x.detach() * MATRIX[0, 0] + (x[:, :2] @ MATRIX).clamp(0.0, 0.3).sum(
+        -1, keepdim=True
+    )
+
+
+@pytest.mark.parametrize("step", [loops, cut])
+def test_loops_and_what_is_cut_have_the_gradients_of_the_definition(step: Callable[..., Any]) -> None:
+    program, x = lanes.Program(step), drawn(5, 12).requires_grad_()
+    with torch.no_grad():
+        x[3] = math.nan
+    more = [GAIN, MATRIX, *([LARGE, FEW] if step is loops else [])]
+    given = x, (), ()
+    found, wanted = (gradients(run, given, *more, steps=3) for run in (program, program.definition))
+    for one, other in zip(found, wanted, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-10, atol=1e-12, equal_nan=True)
+    x.data[3] = 0.0
+    close(*(gradients(run, given, *more, steps=3) for run in (program, program.definition)), tolerance=1e-10)

@@ -36,6 +36,11 @@ class Recipe(NamedTuple):
     found: list[Tensor]  # floating-point tensors that were there before
     checks: list[tuple[Tensor, Any]]  # numbers that the step itself read, and depends on; lists of all
 
+    @property
+    def repeats(self) -> bool:
+        """Whether other numbers follow from other tensors."""
+        return all(tensor.numel() for tensor in self.found)
+
     def again(self, others: Mapping[int, Tensor]) -> Tensor | None:
         """The numbers with other tensors in place of those found; None where the program would be another."""
         if any(id(tensor) not in others for tensor in self.found):
@@ -49,6 +54,64 @@ class Recipe(NamedTuple):
             if any(not _same(known.get(id(tensor), tensor), value) for tensor, value in self.checks):
                 return None
             return _joined([_read(known.get(id(tensor), tensor), at) for tensor, at in self.reads])
+
+
+class TableSlopes:
+    """Slopes by captured tensors, of those by the numbers of a table that follow from them.
+
+    Args:
+        recipe: of the table.
+        of: found tensors.
+
+    Attributes:
+        runs: of the numbers: where each begins, and its length.
+    """
+
+    def __init__(self, recipe: Recipe, of: Sequence[Tensor]) -> None:
+        self._recipe, self._of, start = recipe, of, 0
+        made = {id(tensor) for tensor in of}
+        for _, args, kwargs, out in recipe.operations:
+            if any(id(t) in made for t in tensors((args, kwargs))):
+                made.update(id(t) for t in tensors(out))
+        self.runs: list[tuple[int, int]] = []
+        self._reads = []
+        for tensor, at in recipe.reads:
+            if id(tensor) in made:
+                self.runs.append((start, len(at)))
+                self._reads.append((tensor, torch.from_numpy(at)))
+            start += len(at)
+        needed, kept = {id(tensor) for tensor, _ in self._reads}, []
+        for operation in reversed(recipe.operations):
+            if any(id(t) in needed for t in tensors(operation[3])):
+                kept.append(operation)
+                needed.update(id(t) for t in tensors(operation[1:3]))
+        self._operations = [*reversed(kept)]
+
+    def __call__(self, others: Sequence[Tensor], by_numbers: Sequence[Tensor]) -> list[Tensor]:
+        """Return the slopes.
+
+        Args:
+            others: what stands in place of all that were found.
+            by_numbers: slopes, run by run.
+        """
+        known = {id(found): each.detach() for found, each in zip(self._recipe.found, others, strict=True)}
+        with torch.enable_grad():
+            wanted = [known[id(tensor)].requires_grad_() for tensor in self._of]
+            for function, args, kwargs, out in self._operations:
+                if function is torch.ops.aten.detach.default:  # of what autograd keeps; the same numbers
+                    known[id(out)] = _swapped(args[0], known)
+                    continue
+                result = function(*_swapped(args, known), **_swapped(kwargs, known))
+                for old, new in zip(tensors(out), tensors(result), strict=True):
+                    known[id(old)] = new
+            read = [(known.get(id(tensor), tensor), at) for tensor, at in self._reads]
+            numbers = [tensor.reshape(-1)[at.to(tensor.device)] for tensor, at in read]
+        pairs = [(x, slope.to(x)) for x, slope in zip(numbers, by_numbers, strict=True) if x.requires_grad]
+        if not pairs:
+            return [torch.zeros_like(x) for x in wanted]
+        ends, slopes = zip(*pairs, strict=True)
+        found = torch.autograd.grad(ends, wanted, slopes, allow_unused=True)
+        return [torch.zeros_like(x) if y is None else y for x, y in zip(wanted, found, strict=True)]
 
 
 class Captured:

@@ -118,6 +118,21 @@ class Graph:
                 stack += [*loop.initial, *inside]
         return tuple(sorted(found))
 
+    def close(self, number: int) -> None:
+        """Place a loop that has been written down: as far outside as what it reads allows."""
+        loop, seen = self.loops[number], set[int]()
+        free, stack = set(loop.initial), [*loop.following, *loop.condition]
+        stack += [node for part in loop.collected for node in part]
+        while stack:
+            node = stack.pop()
+            if self.depth[node] < loop.depth:
+                free.add(node)
+            elif node not in seen:
+                seen.add(node)
+                stack += self.args[node]
+        loop.home = max((self.depth[node] for node in free), default=0)
+        loop.node = self.add("loop", sorted(free), "none", number, loop.home)
+
     def constant(self, value: float | bool, type: str) -> int:
         """The node of a number."""
         if type == FLAG:

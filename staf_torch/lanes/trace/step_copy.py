@@ -1,0 +1,158 @@
+"""A copy of a step for its adjoint: the carry is an input like any other, innermost loops alone are left."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from ..emit.schedule import Sizes
+from .graph import NOW, ROW, STEP, Graph, Loop
+from .tracer import NotLoweredError
+
+_MOST = 40_000  # nodes of a program whose loops are written out
+
+
+class NoReverseError(NotLoweredError):
+    """A program has no adjoint of this form."""
+
+
+class StepCopy:
+    """The numbers of a step in a graph of its own, from the carry and the inputs of a time alike.
+
+    Innermost loops stay loops, which also collect their carry before every pass; the others are written out.
+
+    Args:
+        graph, layout: of the step.
+        roots: what is wanted of it.
+
+    Attributes:
+        graph: the copy: the leaves of the carry are the first inputs of a time.
+        roots: these numbers there.
+        kept: the loops of the step, by the nodes of those that stay.
+    """
+
+    def __init__(self, graph: Graph, layout: Sizes, roots: Sequence[int]) -> None:
+        self._of, self.graph = graph, Graph(graph.single)
+        self._carries = len(layout.carries)
+        deepest = max((loop.depth for loop in graph.loops), default=STEP)
+        self._known: list[dict[int, int]] = [{} for _ in range(deepest + 1)]  # of nodes, by their depth
+        self._pass: dict[int, tuple[int, bool]] = {}  # of a loop: which one, or the loop that stays, reversed
+        self._ends: dict[int, list[int]] = {}  # of loops: their results, and what they collected
+        self._collected: dict[int, list[int]] = {}
+        self.kept: dict[int, int] = {}
+        self._copy(roots)
+        self.roots = [self._at(root) for root in roots]
+
+    def _at(self, node: int) -> int:
+        return self._known[self._of.depth[node]][node]
+
+    def _copy(self, roots: Sequence[int]) -> None:
+        waiting = [*reversed(roots)]
+        while waiting:
+            node = waiting[-1]
+            place = self._known[self._of.depth[node]]
+            if node not in place:
+                missing = [a for a in self._of.args[node] if a not in self._known[self._of.depth[a]]]
+                if missing:
+                    waiting += missing
+                    continue
+                place[node] = self._made(node)
+                if len(self.graph.op) > _MOST:
+                    raise NoReverseError("its loops are too long to be written out")
+            waiting.pop()
+
+    def _made(self, node: int) -> int:
+        old, new = self._of, self.graph
+        op, aux, type = old.op[node], old.aux[node], old.type[node]
+        if op == "loop":
+            return self._keep(aux) if self._stays(aux) else self._write_out(aux)
+        args = [self._at(a) for a in old.args[node]]
+        if op == "row":
+            return new.add(op, (), type, aux, ROW)
+        if op in ("now", "state"):
+            return new.add("now", (), type, (aux[0] + (self._carries if op == "now" else 0), aux[1]), NOW)
+        if op == "elem":
+            return entry(new, args[0], aux)
+        if op == "load":
+            return self._load(args[0], type, *aux)
+        if op in ("result", "results", "collect"):
+            found: int = (self._collected if op == "collect" else self._ends)[aux[0]][aux[1]]
+            return found
+        if op == "where":
+            return new.where(*args)
+        if op in ("const", "param", "map", "dot", "pack", "cast"):
+            return new.add(op, args, type, aux)
+        return new.apply(op, *args)
+
+    def _load(self, array: int, type: str, number: int, at: int, stride: int) -> int:
+        """An entry of an array that a pass takes."""
+        if not self._stays(number):
+            return entry(self.graph, array, at + self._pass[number][0] * stride)
+        here, back = self._pass[number]
+        if back:
+            at, stride = at + (self._of.loops[number].count - 1) * stride, -stride
+        return self.graph.add("load", (array,), type, (here, at, stride), STEP + 1)
+
+    def _stays(self, number: int) -> bool:
+        """Whether a loop stays one: it has no loops in it, and its carry is single numbers."""
+        old, loop = self._of, self._of.loops[number]
+        inner = any(other.home >= loop.depth for other in old.loops)
+        return not inner and all(old.op[node] == "carry" for node in loop.carry)
+
+    def body(
+        self, number: int, here: int, carry: Sequence[int], *, back: bool
+    ) -> tuple[list[int], list[list[int]]]:
+        """Copy a pass; return what follows, and what is collected.
+
+        Args:
+            number: of the loop in the step.
+            here: the loop that stays, or which pass.
+            carry: before it.
+            back: whether passes are taken from the last to the first.
+        """
+        loop = self._of.loops[number]
+        self._pass[number] = here, back
+        self._known[loop.depth] = dict(zip(loop.carry, carry, strict=True))
+        self._copy([*loop.following, *(node for part in loop.collected for node in part)])
+        return [*map(self._at, loop.following)], [[*map(self._at, part)] for part in loop.collected]
+
+    def _keep(self, number: int) -> int:
+        old, new, here = self._of.loops[number], self.graph, len(self.graph.loops)
+        loop = Loop(old.count, STEP + 1)
+        new.loops.append(loop)
+        loop.initial = [*map(self._at, old.initial)]
+        kinds = [self._of.type[node] for node in old.carry]
+        loop.carry = [new.add("carry", (), kind, (here, k), STEP + 1) for k, kind in enumerate(kinds)]
+        loop.following, loop.collected = self.body(number, here, loop.carry, back=False)
+        loop.collected += [[node] for node in loop.carry]
+        new.close(here)
+        self.kept[loop.node] = number
+        self._ends[number] = [
+            new.add("result", (loop.node,), kind, (here, k)) for k, kind in enumerate(kinds)
+        ]
+        self._collected[number] = [collected(new, here, k) for k in range(len(old.collected))]
+        return loop.node
+
+    def _write_out(self, number: int) -> int:
+        old, new = self._of.loops[number], self.graph
+        now, parts = [*map(self._at, old.initial)], [list[int]() for _ in old.collected]
+        for k in range(old.count):
+            now, made = self.body(number, k, now, back=False)
+            for part, nodes in zip(parts, made, strict=True):
+                part += nodes
+        self._ends[number] = now
+        self._collected[number] = [new.add("pack", part, new.type[part[0]], len(part)) for part in parts]
+        return -1
+
+
+def collected(graph: Graph, number: int, part: int) -> int:
+    """The array of a part of what a loop collects."""
+    loop = graph.loops[number]
+    nodes = loop.collected[part]
+    return graph.add("collect", (loop.node,), graph.type[nodes[0]], (number, part, loop.count * len(nodes)))
+
+
+def entry(graph: Graph, array: int, place: int) -> int:
+    """The number at a place of an array."""
+    if graph.op[array] == "pack":
+        return graph.args[array][place]
+    return graph.add("elem", (array,), graph.type[array], place)
