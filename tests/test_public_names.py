@@ -267,6 +267,7 @@ def test_the_search_finds_a_method_and_asks_no_server(site: Path, tmp_path: Path
         ("V^(y; x) = w_1 k(y, c_1(x)).", "V ^ ( y ; x ) = w 1 k ( y , c 1 ( x ) ) ."),
         ("the rate e^{-|z|^2 / 2 width^2} of it", "the rate e \u2212 | z | 2 / 2 width 2 of it"),
         ("M &lt;= 6, V* and (B, T, n)", "M ≤ 6 , V* and (B, T, n)"),
+        ("a &lt;- a + g in a step", "a ← a + g in a step"),
         ("a plain sentence: near_optimal (see torch>=2.6)", ""),
     ],
 )

@@ -16,16 +16,27 @@ _FUNCTIONS = {
 }
 _WORDS = {*_FUNCTIONS, "sum", "integral"}
 _SIGNS = {sign: sign for sign in "<>+=/|,;×≤≥"}
-_SIGNS |= {"<=": "≤", ">=": "≥", "!=": "≠", "->": "→", "...": "…", "-": "−", "*": "·", ".": "·", "'": "′"}
+_SIGNS |= {
+    "<=": "≤",
+    ">=": "≥",
+    "!=": "≠",
+    "->": "→",
+    "<-": "←",
+    "...": "…",
+    "-": "−",
+    "*": "·",
+    ".": "·",
+    "'": "′",
+}
 _SIGNS |= {"sum": "∑", "integral": "∫"}
 _LETTERS = "alpha beta gamma delta epsilon eta theta kappa lambda mu nu pi rho sigma tau phi psi omega"
 _GREEK = dict(zip(_LETTERS.split(), "αβγδεηθκλμνπρστφψω", strict=True))
-_RELATIONS = {"<=", ">=", "!=", "=", "<", ">", "≤", "≥"}
+_RELATIONS = {"<-", "<=", ">=", "!=", "=", "<", ">", "≤", "≥"}
 _TOKEN = re.compile(
     r"(?P<number>(?<![\w.])\d+(?:\.\d+)?(?:e-?\d+)?(?![\w])|(?<=[_^])\d+)"
     r"|(?P<indexed>(?<![\w.])[A-Za-z]\d+(?!\w))"  # x1
     r"|(?P<name>[A-Za-zα-ω]+)"
-    r"|(?P<sign>(?<=\()\.(?=,)|<=|>=|!=|->|\.\.\.|[-+=/|*',;<>×≤≥^_])"
+    r"|(?P<sign>(?<=\()\.(?=,)|<=|>=|!=|->|<-|\.\.\.|[-+=/|*',;<>×≤≥^_])"
     r"|(?P<open>[(\[{])|(?P<close>[)\]}])|(?P<space>\s+)|(?P<other>.)",
     re.DOTALL,
 )
@@ -80,7 +91,9 @@ def _words(tokens: list[Token]) -> Iterator[Token]:
             inside.append(before in ("_", "^", *_FUNCTIONS) or bool(inside and inside[-1]))
         elif kind == "close" and inside:
             inside.pop()
-        letter = len(text) == 1 and not (text in "aAI" and after == " " and before in ("", " "))
+        next_sign = tokens[i + 2][1] if i + 2 < len(tokens) else ""
+        article = text in "aAI" and after == " " and before in ("", " ")
+        letter = len(text) == 1 and (not article or next_sign in {"+", *_RELATIONS})
         known = text in _WORDS or text in _GREEK or (len(text) <= 3 and before in ("_", "^"))
         if kind != "name" or letter or known or (inside and inside[-1]):
             yield kind, text
