@@ -48,7 +48,7 @@ def forecasts(filter_: LocalFilter, x: Tensor, y: Tensor, lapse: Tensor) -> tupl
     law = (filter_.ratio, filter_.forgetting, filter_.slack, filter_.robust, filter_.base)
     numbers = tuple(torch.as_tensor(part, device=x.device).double().expand(rows) for part in law)
     if isinstance(functions, OwnFunctions):
-        row = tuple(part.movedim(-1, 0) for part in functions), numbers
+        row = tuple(part.movedim(-1, 0).to(x.device) for part in functions), numbers
         mean, deviation = _FILTER(_fresh(x, y, functions.offsets.shape[0]), (x, y, lapse), row)[1]
         return mean, deviation
 
