@@ -146,12 +146,9 @@ class NearOptimal(SampledRollout):
     def __repr__(self) -> str:
         plant, cost, reach = self.plant, self.cost, self.reach
         way = "the LQR and its rollouts" if self.memory is None else "a global value"
-        least = (
-            None
-            if reach.regulated is None
-            else float(all_rows(torch.as_tensor(reach.regulated, dtype=torch.float64, device="cpu")).min())
-        )
-        known = "" if least is None else f", {100 * least:.0f} % of it regulated"
+        share = math.nan if reach.regulated is None else reach.regulated  # of rows the least
+        least = float(all_rows(torch.as_tensor(share, dtype=torch.float64, device="cpu")).min())
+        known = "" if math.isnan(least) else f", {100 * least:.0f} % of it regulated"
         box = ", ".join(map(shown, reach.box))
         return (
             f"NearOptimal({type(plant).__name__}, {sizes(cost.dim, cost.inputs)}, held for "
