@@ -29,7 +29,7 @@ from ..settings.adp import adp_problem
 from ..settings.chase import make_metrics
 from ..systems import Plant
 from ..tables.columns import significant
-from .numbers_of_jobs import RowsOfJobs, in_calls
+from .numbers_of_jobs import RowsOfJobs, ToldOnce, in_calls
 from .registry import BatchedExperiment, Metrics
 from .scenes import animation_kind, loop_scene, write_animation
 from .study import log_diverged, trajectories, write_history
@@ -178,6 +178,7 @@ def simulate_together(
         progress: as in `simulate`.
     """
     found: dict[int, LoopResult] = {}
+    told = ToldOnce(progress)
 
     def shared(i: int) -> tuple[object, ...]:
         one = problems[i]
@@ -189,8 +190,9 @@ def simulate_together(
             jobs: Sequence[int], objects: Any, rows: RowsOfJobs, indices: Sequence[int] = indices
         ) -> None:
             chosen = [indices[job] for job in jobs]
-            with rows.of():
-                results = _simulated([problems[i] for i in chosen], objects, progress)
+            with rows.of(), told.call() as tell:
+                heard = None if progress is None else tell
+                results = _simulated([problems[i] for i in chosen], objects, heard)
             found.update(zip(chosen, results, strict=True))
 
         in_calls(

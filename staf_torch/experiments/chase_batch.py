@@ -21,7 +21,7 @@ from ..optim import UpdateLaw
 from ..results.files import grouped
 from ..settings.chase import ChaseProblem, warnings_to
 from ..systems import ControlAffineSystem, trajectory
-from .numbers_of_jobs import RowsOfJobs, in_calls
+from .numbers_of_jobs import RowsOfJobs, ToldOnce, in_calls
 
 Sink = Callable[[Mapping[str, np.ndarray], int, int], None]
 """Takes a piece of a problem's history, name -> (b, C, ...), with its first row and its first time."""
@@ -69,7 +69,7 @@ def simulate(
         In the order of the problems.
     """
     found: dict[int, Outcome] = {}
-    alone = len(problems) == 1
+    alone, told = len(problems) == 1, ToldOnce(advance)
 
     def shared(i: int) -> tuple[object, ...]:
         return (problems[i].dt, *map(id, problems[i].metrics))
@@ -81,7 +81,8 @@ def simulate(
         ) -> None:
             chosen = [indices[job] for job in jobs]
             members = [_BatchMember(problems[i], sinks[i], drawn[i]) for i in chosen]
-            found.update(zip(chosen, _run(members, parts, rows, advance, errors, alone=alone), strict=True))
+            with told.call() as tell:
+                found.update(zip(chosen, _run(members, parts, rows, tell, errors, alone=alone), strict=True))
 
         in_calls(
             [_Objects.of(problems[i]) for i in indices],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import torch
@@ -41,6 +41,36 @@ class RowsOfJobs:
     def of(self, rows: slice = slice(None)) -> contextlib.AbstractContextManager[None]:
         """Batches of the block hold these rows of the call."""
         return some_rows(self._kind[rows]) if self.differ else contextlib.nullcontext()
+
+
+class ToldOnce:
+    """Progress of calls, of which one that fails is made again in parts: nothing is told twice.
+
+    Args:
+        advance: is told how much more is done; None where nobody listens.
+    """
+
+    def __init__(self, advance: Callable[[int], None] | None) -> None:
+        self._advance, self._ahead = advance, 0  # told by calls that failed
+
+    @contextlib.contextmanager
+    def call(self) -> Iterator[Callable[[int], None]]:
+        """Yield what is told of a call's progress within the block."""
+        told = 0
+
+        def tell(count: int) -> None:
+            nonlocal told
+            told += count
+            known = min(self._ahead, count)
+            self._ahead -= known
+            if self._advance is not None and count > known:
+                self._advance(count - known)
+
+        try:
+            yield tell
+        except BaseException:
+            self._ahead += told
+            raise
 
 
 def in_calls(objects: Sequence[Objects], counts: Sequence[int], call: Call, *, apart: bool = False) -> None:

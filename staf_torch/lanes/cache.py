@@ -377,7 +377,8 @@ def unpatched() -> bool:
     if len(values) != len(seen) or not all(
         map(is_, values, seen)
     ):  # looked at again only if something is new
-        own = not any(map(_foreign, values))
+        known = {id(value) for value in seen} if own else set[int]()  # all alive, as `seen` holds them
+        own = not any(_foreign(value) for value in values if id(value) not in known)
         _last = values, own
     return own
 

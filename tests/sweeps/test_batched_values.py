@@ -21,6 +21,7 @@ from truth import paper
 from staf_torch import rings
 from staf_torch.experiments.adp import LoopSolution, Regulation
 from staf_torch.experiments.gradient_chase import ChaseSolution, GradientChase
+from staf_torch.experiments.numbers_of_jobs import ToldOnce
 from staf_torch.results import run_record
 from staf_torch.results.progress import SHOWN
 from staf_torch.sweeps import batching
@@ -314,3 +315,21 @@ def test_writing_what_was_solved_leaves_what_a_run_leaves(tmp_path: Path) -> Non
             assert np.array_equal(found[key], expected[key]), key
     numbers = [json.loads(each["metrics.json"].read_text()) for each in files]
     assert numbers[0] == pytest.approx(numbers[1], rel=1e-9, abs=1e-12)
+
+
+def test_a_call_that_fails_and_is_made_again_in_parts_counts_its_progress_once() -> None:
+    told: list[int] = []
+    once = ToldOnce(told.append)
+
+    def fails() -> None:
+        with once.call() as tell:
+            tell(3)
+            tell(4)
+            raise ValueError("midway")
+
+    with pytest.raises(ValueError, match="midway"):
+        fails()
+    for _ in range(2):
+        with once.call() as tell:
+            tell(5)
+    assert sum(told) == 10
