@@ -60,7 +60,7 @@ def _unsigned_product(word: Any, factor: int) -> tuple[Any, Any]:
 def seed_parts(seeds: Sequence[int], like: Tensor) -> Tensor:
     """Return the four 16-bit parts of seeds, (B, 4), which every float holds."""
     if isinstance(seeds, range) and seeds and max(seeds[0], seeds[-1]) < 2**63:  # of a million rows, say
-        whole = torch.arange(seeds.start, seeds.stop, seeds.step, dtype=torch.int64, device="cpu")
+        whole = torch.arange(seeds.start, seeds.stop, seeds.step, device=like.device)
         rows = torch.stack([(whole >> (16 * k)) & _HALF for k in range(4)], dim=-1)
     else:
         parts = [[(seed >> (16 * k)) & _HALF for k in range(4)] for seed in seeds]

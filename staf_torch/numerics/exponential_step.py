@@ -217,7 +217,7 @@ def needed_steps(
         tolerance: of the errors.
         enough: error that is left as it is without more steps.
     """
-    count = len(most)
+    count, most = len(most), most.cpu()
     factor, error = (
         torch.ones(count, dtype=torch.int64, device="cpu"),
         torch.full((count,), math.inf, dtype=torch.float64, device="cpu"),
