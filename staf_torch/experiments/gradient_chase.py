@@ -253,5 +253,5 @@ def _settled(time: float | None, show: Callable[[str], str]) -> str:
     """Say from when on the excess is at most its largest value after `settle_time`: maybe from the start."""
     if time is None:
         return "excess not known"
-    since = "at no time above" if time == 0 else f"from {show('settling_time')} s on at most"
-    return f"excess {since} its ultimate {show('ultimate_excess')}"
+    since = "at all times" if time == 0 else f"from {show('settling_time')} s on"
+    return f"excess {since} at most {show('ultimate_excess')}"
