@@ -319,7 +319,7 @@ def _explain(cfg: DictConfig, solved: LoopSolution) -> None:
             _log.info(told, ", ".join(others))
     error, ratio = solved.optimum.control_error, solved.metrics["cost_ratio"]
     if error is not None and ratio is not None and ratio > 1 + _LEARNING:
-        told = "  above the optimum: paid wherever u is not u*; at t = 0, by the initial weights alone, |u - u*| is %s"
+        told = "  above the optimum: paid wherever u is not u*; at t = 0, by the first weights, |u-u*| is %s"
         _log.info(told, significant(float(error[:, 0].max()), 3))
 
 
