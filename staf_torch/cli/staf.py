@@ -26,6 +26,12 @@ _PARTS = {
     "schema": "staf_torch.cli.schema",
     "docs": "staf_torch.cli.site.build",
 }
+_LINES = {
+    "doctor": "staf doctor: check this machine; exit code 1 where something is wrong.",
+    "schema": "staf schema [GROUP]: print the settings, or those of one group, as a JSON schema.",
+    "docs": "staf docs [FOLDER [ROOM ...]]: build the site of guides and reference pages (into `site`).",
+}
+"""What `--help` says of each."""
 
 
 def main() -> None:
@@ -37,6 +43,8 @@ def main() -> None:
     if words == ["--version"]:
         sys.exit(print(f"staf_torch {__version__} (source {source()})"))
     if words and words[0] in _PARTS:
+        if {"--help", "-h"} & set(words[1:]):
+            sys.exit(print(_LINES[words[0]]))
         sys.exit(_ended(importlib.import_module(_PARTS[words[0]]).main, words[1:]))
     if words and re.fullmatch(r"[A-Za-z_]\w*", words[0]):  # Hydra's grammar would say what is missing at EOF
         sys.exit(f"staf: {_unknown(words[0])}")

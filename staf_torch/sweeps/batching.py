@@ -25,7 +25,7 @@ from ..experiments.registry import (
 from ..figures.style import FigurePaper, printed_on
 from ..results.progress import SHOWN, Progress
 from ..settings.plain import to_read
-from ..settings.suggestions import without_setting
+from ..settings.suggestions import without_option, without_setting
 from .workers import LostError
 
 _log = logging.getLogger(__name__)
@@ -232,8 +232,14 @@ def sentence(error: BaseException) -> str:
         return without_setting(unknown[1])
     if isinstance(error, MissingConfigException) and error.options:
         name = (error.missing_cfg_file or "").removesuffix(".yaml")
-        more = "; others come with the extras joblib, slurm, ray and optuna" if "hydra/" in name else ""
-        return f"there is no `{name}`; there are {', '.join(error.options)}{more}."
+        return without_option(name, error.options)
+    several = re.match(r"Ambiguous value for argument '([^=]+)=(.*)'", str(error))
+    if several:
+        line = f"{several[1]}={several[2]}"
+        return (
+            f"`{line}` is a list, and a list is a sweep: `staf -m {line}`; "
+            f"one setting that is a list is written `{several[1]}=[{several[2]}]`."
+        )
     return str(error)
 
 

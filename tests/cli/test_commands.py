@@ -53,6 +53,13 @@ def test_the_doctor_finds_this_machine_sound(staf: Any, monkeypatch: pytest.Monk
     assert "OMP_NUM_THREADS 1" in said
 
 
+@pytest.mark.parametrize("command", ["doctor", "schema", "docs"])
+def test_help_of_a_command_is_its_line(staf: Any, command: str) -> None:
+    code, said = staf(command, "--help")
+    assert (code or 0, said.count("\n")) == (0, 1)
+    assert said.startswith(f"staf {command}")
+
+
 def test_the_doctor_says_where_the_problem_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -196,6 +196,7 @@ def missing(name: str | None, options: list[str] | None) -> MissingConfigExcepti
 
 
 DISK = OSError(errno.ENOSPC, "No space left", "a/file")
+OWN = " One of your own needs `--config-dir FOLDER`."
 OTHERS = "; others come with the extras joblib, slurm, ray and optuna"
 
 
@@ -217,9 +218,23 @@ OTHERS = "; others come with the extras joblib, slurm, ray and optuna"
             "there is no setting `centers.raduis`; did you mean `centers.radius`?",
         ),
         (HydraException("it Could not override 'a'"), "it Could not override 'a'"),
-        (missing("kernel/gauss", ["a", "b"]), "there is no `kernel/gauss`; there are a, b."),
+        (
+            ConfigKeyError("Could not override 'optimizer.iterations'.\nKey is not there"),
+            "there is no setting `optimizer.iterations`; did you mean `optimizer.inner_steps`?",
+        ),
+        (
+            HydraException("Ambiguous value for argument 'kernel=a,b'\n1. To use it as a list"),
+            "`kernel=a,b` is a list, and a list is a sweep: `staf -m kernel=a,b`; "
+            "one setting that is a list is written `kernel=[a,b]`.",
+        ),
+        (missing("kernel/gauss", ["a", "b"]), f"there is no `kernel/gauss`; there are a, b.{OWN}"),
+        (
+            missing("kernel/inverse_rot", ["matern", "inverse_multiquadric"]),
+            "there is no `kernel/inverse_rot`; there are matern, inverse_multiquadric. "
+            f"Did you mean `inverse_multiquadric`?{OWN}",
+        ),
         (missing("hydra/launcher/x.yaml", ["a"]), f"there is no `hydra/launcher/x`; there are a{OTHERS}."),
-        (missing(None, ["a"]), "there is no ``; there are a."),
+        (missing(None, ["a"]), f"there is no ``; there are a.{OWN}"),
         (missing("kernel/gauss", []), "not found"),
         (missing("kernel/gauss", None), "not found"),
     ],
