@@ -168,10 +168,14 @@ def differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str
 
 
 def short(build: Mapping[str, Any]) -> str:
-    """Return a build as a table names it: `0.2.0 source 3f2a91b0c4d5 torch 2.13.0 other 4a5b6c`."""
+    """Return a build without the user's modules: `0.2.0 source 3f2a91b0c4d5 torch 2.13.0 compiler 4a5b6c`."""
     text = f"{build.get('version')} source {build.get('source')} torch {build.get('torch')}"
-    rest = json.dumps([build.get("compiler"), build.get("modules")], sort_keys=True)
-    return f"{text} other {hashlib.sha256(rest.encode()).hexdigest()[:6]}"
+    return f"{text} compiler {shortened(build.get('compiler'))}"
+
+
+def shortened(value: Any) -> str:
+    """Return the first six digits of the hash of a value as JSON has it."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:6]
 
 
 def _plain(value: Any) -> dict[str, Any]:

@@ -196,6 +196,7 @@ def _of_record(directory: Path, record: Mapping[str, Any]) -> RecordedRun:
         declared=read_infos(record.get("metrics")),
         lost=lost,
         build=short(made_by) if isinstance(made_by, dict) else None,
+        modules={name: one for name, one in _table(_table(made_by).get("modules")).items() if _text(one)},
         **{name: _text(record.get(name)) for name in ("began", "machine", "python")},  # type: ignore[arg-type]
         units={str(key): str(text) for key, text in _table(record.get("units")).items()},
     )

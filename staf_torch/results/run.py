@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from .._version import __version__
+from .build import shortened
 from .files import Value, is_number
 from .metric_info import HEADLINES, OWN, MetricInfo
 from .untrusted import visible
@@ -45,7 +46,8 @@ class RecordedRun:
     seconds: float | None = None
     declared: Mapping[str, MetricInfo] = dataclasses.field(default_factory=dict)  # of the user's own metrics
     lost: Mapping[str, str] = dataclasses.field(default_factory=dict)  # metric -> what stood there instead
-    build: str | None = None  # what else made the numbers: source, torch, compiler, own modules
+    build: str | None = None  # what else made the numbers: source, torch, compiler
+    modules: Mapping[str, str] = dataclasses.field(default_factory=dict)  # the user's own -> hash
     began: str | None = None  # date and time, ISO 8601, UTC
     machine: str | None = None
     python: str | None = None  # its version
@@ -66,6 +68,8 @@ class RecordedRun:
         """Return anything about the run that has a name: a metric, one of `ABOUT`, or a setting."""
         if key in self.metrics:
             return self.metrics[key]
+        if key == "build" and self.modules:
+            return f"{self.build} modules {shortened(dict(self.modules))}"
         if key in ABOUT:
             found = getattr(self, key)
             return visible(str(found)) if isinstance(found, Path) else found
@@ -142,7 +146,8 @@ class Collection:
     def unswept(self) -> tuple[str, ...]:
         """Settings that differ between runs although nobody overrode them, and `build` where that differs.
 
-        Somebody edited a file between two of the runs. What an interpolation takes from an override is none.
+        Somebody edited a file between two of the runs. What an interpolation takes from an override is none,
+        nor are the user's modules that only some runs need: the option that names them is a setting.
         """
         overridden = self._overridden
         words = [key for key in overridden if any(isinstance(run.setting(key), str) for run in self.rows)]
@@ -158,7 +163,9 @@ class Collection:
             if other is not run:
                 found |= dict.fromkeys(_differ(run, other))
         builds = {run.build for run in self.rows}
-        return (*(key for key in found if not _explained(key, overridden)), *["build"] * (len(builds) > 1))
+        hashes = {module for run in self.rows for module in run.modules.items()}
+        differ = len(builds) > 1 or len(hashes) > len({name for name, _ in hashes})
+        return (*(key for key in found if not _explained(key, overridden)), *["build"] * differ)
 
     @functools.cached_property
     def _settings(self) -> list[Mapping[str, Value]]:

@@ -108,12 +108,13 @@ def facts(directory: Path, found: Collection) -> dict[str, str]:
     began = sorted(run.began for run in found.rows if run.began)
     builds = _all(run.build for run in found.rows) or _all(run.version for run in found.rows)
     python = _all(run.python for run in found.rows)
+    own = _all(f"{name} {digits}" for run in found.rows for name, digits in sorted(run.modules.items()))
     told = {
         "command": f"staf -m {shlex.join(words)}" if words else "",
         "date": " to ".join(dict.fromkeys([*began[:1], *began[-1:]])),
         "machine": _all(run.machine for run in found.rows),
         "versions": ", ".join(
-            filter(None, [builds and f"staf_torch {builds}", python and f"Python {python}"])
+            filter(None, [builds and f"staf_torch {builds}", python and f"Python {python}", own])
         ),
         "units": _all(", ".join(f"{name} {unit}" for name, unit in run.units.items()) for run in found.rows),
     }

@@ -267,6 +267,15 @@ def test_settings_that_differ_although_nobody_swept_them_are_named(
     assert found(run("a", first, one), run("b", second, two, build="other")).unswept == (*named, "build")
 
 
+def test_an_own_module_that_only_some_runs_need_is_no_other_build() -> None:
+    plain, mine = run("a", build="b"), run("b", build="b", modules={"mine": "1", "helper": "1"})
+    other = run("c", build="b", modules={"mine": "1", "third": "1"})
+    assert found(plain, mine, other).unswept == ()
+    edited = run("d", build="b", modules={"mine": "2", "helper": "1"})
+    assert found(plain, mine, edited).unswept == found(plain, run("e", build="c")).unswept == ("build",)
+    assert len({each.value("build") for each in (plain, mine, edited)}) == 3
+
+
 def test_rows_share_the_settings_of_their_sweep() -> None:
     shared = {"dt": 7, "seed": 0}
     one, two = (run(overrides={"seed": n}, settings=ChainMap({"seed": n}, shared)) for n in (1, 2))

@@ -68,7 +68,7 @@ def test_a_build_names_version_source_torch_and_modules() -> None:
     }
     assert made["torch"] == importlib.metadata.version("torch")
     assert (made["source"], len(made["source"])) == (build.source(), 12)
-    assert short(made).startswith(f"{__version__} source {made['source']} torch {made['torch']} other ")
+    assert short(made).startswith(f"{__version__} source {made['source']} torch {made['torch']} compiler ")
     assert short(made | {"compiler": "d"}) != short(made) == short(json.loads(json.dumps(made)))
 
 
