@@ -264,15 +264,15 @@ def _lines(axes: Axes, shown: Panel) -> None:
             axes.fill_between(x, low, high, color=colour(i), alpha=0.2, linewidth=0)
         if curve.floor:
             floor = [point.middle for point in curve.floor]
-            (dots,) = axes.plot(
-                [point.x for point in curve.floor], floor, ":", color=colour(i), linewidth=0.9
+            axes.plot(
+                [point.x for point in curve.floor], floor, ":", color=colour(i), linewidth=0.9, label="_"
             )
-            dots.set_label("_" if i else "ideal weights")
 
 
 @contextlib.contextmanager
 def _errors(shown_panels: Sequence[Panel]) -> Iterator[tuple[Figure, list[Axes]]]:
     """Yield a page with the lines of all panels; in the end it gets limits and one legend."""
+    from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     labels = [curve.label for curve in shown_panels[0].curves]
@@ -289,6 +289,8 @@ def _errors(shown_panels: Sequence[Panel]) -> Iterator[tuple[Figure, list[Axes]]
         lines: dict[str, Artist] = {str(line.get_label()): line for axes in grid for line in axes.get_lines()}
         handles = [line for label, line in lines.items() if not label.startswith("_")]
         handles.sort(key=lambda line: line.get_marker() == "None")  # type: ignore[attr-defined]
+        if any(curve.floor for shown in shown_panels for curve in shown.curves):
+            handles.append(Line2D([], [], color="0.4", linestyle=":", linewidth=0.9, label="ideal weights"))
         if any(point.high > _VISIBLE * point.low for point in _points_of(shown_panels)):
             handles.append(Patch(color="0.4", alpha=0.25, linewidth=0, label="95 % over seeds"))
         legend(*grid, handles=handles)

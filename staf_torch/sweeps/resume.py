@@ -140,6 +140,7 @@ def _difference(directory: Path, given: Sequence[str], typed: Sequence[str]) -> 
     added = " ".join(line for line in given if line not in typed)
     parts = [f"without {missing!r}"] * bool(missing) + [f"with {added!r}"] * bool(added)
     return (
-        f"`staf sweep.resume={directory}` must have the overrides of that sweep, or none; "
-        f"got them {' and '.join(parts) or 'more than once'}. The sweep is: staf -m {' '.join(typed)}"
+        f"`staf -m sweep.resume={directory}` must have the overrides of that sweep, or none; "
+        f"got them {' and '.join(parts) or 'more than once'}. Only settings of Hydra and of the sweep itself "
+        f"(hydra. ..., sweep. ...) may be added. The sweep is: staf -m {' '.join(typed)}"
     )
