@@ -33,6 +33,7 @@ _MOST_PANELS = 12
 _ERROR = r"$\sup\,|V - \hat V|$"  # on the ball
 _ROUNDING = (0, (6, 2))  # dashes
 _VISIBLE = 1.2  # a band this wide can be seen: it has an entry in the legend
+_IDEAL = "ideal weights"
 _COLUMNS = 3
 _FAR = 1e-4  # of the least error: what lies below is not drawn
 _CELL = 0.26  # inches a row of a map is high
@@ -264,9 +265,10 @@ def _lines(axes: Axes, shown: Panel) -> None:
             axes.fill_between(x, low, high, color=colour(i), alpha=0.2, linewidth=0)
         if curve.floor:
             floor = [point.middle for point in curve.floor]
-            axes.plot(
-                [point.x for point in curve.floor], floor, ":", color=colour(i), linewidth=0.9, label="_"
+            (dots,) = axes.plot(
+                [point.x for point in curve.floor], floor, ":", color=colour(i), linewidth=0.9
             )
+            dots.set_label("_" if i else _IDEAL)
 
 
 @contextlib.contextmanager
@@ -276,7 +278,7 @@ def _errors(shown_panels: Sequence[Panel]) -> Iterator[tuple[Figure, list[Axes]]
     from matplotlib.patches import Patch
 
     labels = [curve.label for curve in shown_panels[0].curves]
-    more = ["ideal weights", "rounding of V", "95 % over seeds"]
+    more = [_IDEAL, "rounding of V", "95 % over seeds"]
     spare = labels + more if len(shown_panels) > 1 else ()
     with panels(len(shown_panels), _COLUMNS, spare=spare, sharey=True) as (figure, grid):
         for axes, shown in zip(grid, shown_panels, strict=True):
@@ -287,10 +289,10 @@ def _errors(shown_panels: Sequence[Panel]) -> Iterator[tuple[Figure, list[Axes]]
         grid[0].set_ylim(min(drawn) / 2, max(drawn) * 2)
         # The same label has the same line in every panel: one legend serves them all.
         lines: dict[str, Artist] = {str(line.get_label()): line for axes in grid for line in axes.get_lines()}
+        if _IDEAL in lines:  # of every colour
+            lines[_IDEAL] = Line2D([], [], color="0.4", linestyle=":", linewidth=0.9, label=_IDEAL)
         handles = [line for label, line in lines.items() if not label.startswith("_")]
         handles.sort(key=lambda line: line.get_marker() == "None")  # type: ignore[attr-defined]
-        if any(curve.floor for shown in shown_panels for curve in shown.curves):
-            handles.append(Line2D([], [], color="0.4", linestyle=":", linewidth=0.9, label="ideal weights"))
         if any(point.high > _VISIBLE * point.low for point in _points_of(shown_panels)):
             handles.append(Patch(color="0.4", alpha=0.25, linewidth=0, label="95 % over seeds"))
         legend(*grid, handles=handles)

@@ -21,6 +21,10 @@ _SERIES = 200  # degrees of freedom from which the expansion is more accurate th
 _MOST = 6  # metrics that a table shows where none is declared a headline
 _NAMED = 3  # runs without a result that a note names
 _SEED = "seed"
+_ONE_STATE = (
+    ": it draws the initial states of all trajectories but the first, and there was one. "
+    "With `trajectories=4` three are drawn."
+)
 _ASCENDING, _DESCENDING = ":asc", ":desc"
 
 
@@ -169,7 +173,13 @@ def _without_effect(found: Collection) -> Iterator[str]:
             there.add(metrics)
         compared = [group for group in groups.values() if len(group[0]) > 1]
         if compared and all(len(metrics) == 1 for _, metrics in compared):
-            yield f"`{key}` was swept and changed no metric in any row."
+            said = f"`{key}` was swept and changed no metric in any row"
+            yield f"{said}{_ONE_STATE if key == _SEED and _starts_alone(found.rows) else '.'}"
+
+
+def _starts_alone(runs: Sequence[RecordedRun]) -> bool:
+    """Return whether the runs are chases of a single trajectory each, which begins at `initial_state`."""
+    return all(run.task == "gradient_chase" and run.setting("trajectories") == 1 for run in runs)
 
 
 def _check(found: Collection, layout: Layout) -> None:
