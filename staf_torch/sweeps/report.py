@@ -193,7 +193,9 @@ def _about(found: Collection) -> str:
     tasks = ", ".join(dict.fromkeys(run.task for run in found.rows if run.task))
     versions = ", ".join(dict.fromkeys(run.version for run in found.rows if run.version))
     by = f", staf_torch {versions}" if versions else ""
-    return f"{tasks or 'runs'}: {len(found.rows)} runs, {completed} completed{by}"
+    ended = Counter(run.status for run in found.rows if run.status != COMPLETED)
+    others = "".join(f", {count} {status}" for status, count in ended.items())
+    return f"{tasks or 'runs'}: {len(found.rows)} runs, {completed} completed{others}{by}"
 
 
 def _common(found: Collection) -> dict[str, Value]:

@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import math
 import statistics
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from ..numerics import TABLE_COMMAND, fail
@@ -38,7 +39,8 @@ def deviation(numbers: Sequence[float]) -> float | None:
     if len(numbers) < 2:
         return None
     middle = mean(numbers)
-    return math.hypot(*(number - middle for number in numbers)) / math.sqrt(len(numbers) - 1)
+    found = math.hypot(*(number - middle for number in numbers)) / math.sqrt(len(numbers) - 1)
+    return found if found > 2 * sys.float_info.epsilon * abs(middle) else 0.0  # rounding of the mean
 
 
 def half_width(numbers: Sequence[float]) -> float | None:
