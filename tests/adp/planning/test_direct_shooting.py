@@ -338,3 +338,23 @@ def test_the_gap_of_a_control_is_what_its_hamiltonian_exceeds_the_least_by(affin
         [hamiltonian(torch.full((50, 1), u).double()) for u in torch.linspace(-0.8, 0.8, 2001)]
     )
     torch.testing.assert_close(gap, hamiltonian(v) - tried.amin(0), rtol=1e-4, atol=1e-5)
+
+
+def test_what_costs_more_than_the_base_is_nan_with_that_reason() -> None:
+    class Wheel(systems.ControlAffineSystem):
+        dim, inputs = 3, 1
+
+        def drift(self, x: Tensor) -> Tensor:
+            return torch.stack((x[..., 1], 40 * x[..., 0].sin(), -0.5 * x[..., 2]), dim=-1)
+
+        def effectiveness(self, x: Tensor) -> Tensor:
+            return torch.tensor([[0.0], [-30.0], [600.0]]).to(x).expand(*x.shape, 1)
+
+    plant, x0 = Wheel(), torch.tensor([[-0.1928, -0.2978, 16.2682]], dtype=torch.float64)
+    cost = adp.QuadraticCost([10.0, 1.0, 1e-4], 1.0, dim=3, inputs=1, low=-1.0, high=1.0)
+    found = adp.DirectShooting(plant, cost, starts=1).solve(x0)
+    base = adp.simulate(adp.LQR(plant, cost, period=0.01), plant, cost, x0, dt=0.01, steps=340).cost
+    if bool(found.value.isnan()):
+        assert "more than following the base" in found.reason[0]
+    else:
+        assert found.value <= base * 1.02

@@ -33,7 +33,7 @@ from ...problem.rules import (
 )
 from ...problem.shapes import check_policy, check_problem, check_value
 from ..trajectories import Trajectories, chosen
-from .merging import ROWS, cheapest, joined, merged, selected
+from .merging import ROWS, cheapest, dearer, joined, merged, replaced, selected
 from .mesh import graded, halved, rates_of, split
 from .newton import Interval, MeshPlan, NewtonSolution, follow, minimise, replay, why_none
 from .optimum import Optimum
@@ -292,8 +292,34 @@ class DirectShooting:
         start = follow(self, _always(base), x0, time.diff())
         found = self._improve(start, time, x0, base)
         hard = ~self._believed(found, x0, start.cost)
-        if not bool(hard.any()):  # costs time alone
+        if bool(hard.any()):  # costs time alone
+            found = self._from_more(found, hard, start.cost, x0, time, warm)
+        return self._as_base(found, x0)
+
+    def _as_base(self, found: Optimum, x0: Tensor) -> Optimum:
+        """What was found, and where it costs more than following the base: improved from there, or NaN."""
+        followed = follow(self, _always(self.bases[0]), x0, found.time.diff())
+        rows = dearer(found.value, followed.cost).nonzero().flatten()
+        if not len(rows):  # costs time alone
             return found
+        with some_rows(rows):
+            start, base = MeshPlan(*(part[rows] for part in followed)), x0[rows]
+            end = minimise(self, start, found.time.diff())
+            coarse = end._replace(converged=torch.zeros_like(end.converged))  # no mesh to compare with
+            again = self._optimum(end, coarse, found.time)
+            believed = self._believed(again, base, start.cost)
+        return replaced(found, rows, again, believed, start.cost)
+
+    def _from_more(
+        self,
+        found: Optimum,
+        hard: Tensor,
+        followed: Tensor,
+        x0: Tensor,
+        time: Tensor,
+        warm: Optimum | None,
+    ) -> Optimum:
+        """The optima where one start is not enough, from more; what following the base costs: (B,)."""
         rows = hard.nonzero().flatten()
         search = self._search(time)
         with some_rows(rows):
@@ -302,7 +328,7 @@ class DirectShooting:
                 plans.append(self._warm(warm, x0[rows], rows, time))
             if search is not None and self.stage.cost.bounds is not None:
                 plans += [self._replayed(plan, time.diff()) for plan in search.held(x0[rows])]
-            plans = cheapest(plans, self.starts, start.cost[rows])
+            plans = cheapest(plans, self.starts, followed[rows])
             if self.stage.cost.output is not None:  # plans that end with the base see one valley of the cost
                 plans.append(follow(self, _always(self._resting), x0[rows], time.diff()))
         found = self._several(found, rows, plans, time)

@@ -13,6 +13,7 @@ from .optimum import Optimum
 ROWS = 256  # states solved from at once: a graph of second derivatives is kept for each
 _SAME = 1e-4  # relative, of the values of two starts that found the same
 _MIRRORED = 1e-9  # relative difference of cost below which two guesses are one and its mirror image
+_ROUGH = 1e-3  # relative: what a mesh may add to the value of the base's own control
 _LONE = "local: one start alone"
 
 
@@ -73,12 +74,53 @@ def merged(found: Optimum, rows: Tensor, several: list[Optimum]) -> Optimum:
             reasons[row] = found.reason[row]
         else:
             most, least = max(finite), min(finite)
-            others = f"up to {most / least:.5g} times as much" if least > 0 else f"{least:.4g} to {most:.4g}"
-            local = f"{_LONE} found it, others {others}"
+            others = f"up to {most / least:.7g} times as much" if least > 0 else f"{least:.4g} to {most:.4g}"
+            same = least > 0 and most <= least * (
+                1 + _SAME
+            )  # no number: others ended in the same, unfinished
+            local = f"{_LONE} found it" + ("" if same else f", others {others}")
             own = every[int(best[place])].reason[place]
             lone = not own or own.startswith(_LONE)
             reasons[row] = "" if bool(converged[row]) else local if lone else f"local: {own}"
     columns["converged"] = converged
+    return found._replace(**columns, reason=tuple(reasons))
+
+
+def dearer(value: Tensor, followed: Tensor) -> Tensor:
+    """Rows whose value is more than following the base costs on the same mesh, (B,) bool."""
+    return value > followed + _ROUGH * followed.abs()
+
+
+def replaced(found: Optimum, rows: Tensor, again: Optimum, believed: Tensor, followed: Tensor) -> Optimum:
+    """What was found, with what was found from the base in some rows, or NaN where that costs more too.
+
+    Args:
+        found: B rows.
+        rows: in it, (B',).
+        again: from the base in these rows.
+        believed: rows of these where one start is enough, (B',) bool.
+        followed: cost of following the base there, (B',).
+    """
+    lost = ~torch.isfinite(again.value) | dearer(again.value, followed)
+    columns, reasons = {}, list(found.reason)
+    for name, whole in _tensors(found).items():
+        part = getattr(again, name)
+        if name == "iterations":
+            part = part + whole[rows]
+        elif name == "converged":
+            part = part & believed & ~lost
+        elif name != "optimality":
+            none = lost.reshape(-1, *[1] * (part.dim() - 1))
+            part = torch.where(none, torch.nan, part)
+        columns[name] = whole.index_copy(0, rows, part)
+    for place, row in enumerate(rows.tolist()):
+        if bool(lost[place]):
+            reasons[row] = (
+                f"what was found costs {float(found.value[row]):.4g}, more than following the base "
+                f"({float(followed[place]):.4g}): state more `intervals`, or another `base`"
+            )
+        else:
+            reasons[row] = "" if bool(believed[place]) else f"{_LONE}, the base, found it"
     return found._replace(**columns, reason=tuple(reasons))
 
 
