@@ -18,6 +18,7 @@ _BOUND = (0, (7, 2))  # dashes
 _MOST_TIMES = 4000  # more are thinned out
 _NAMED = 3  # entries that the name of an axis lists
 _IN_A_LEGEND = 8
+_APART = 10.0  # times the size of a state, from which on another one of its unit has its own axis
 _SEEN = 5.0  # times the range of a control, up to which an axis is stretched to its bounds
 
 Group = tuple[str, list[int]]
@@ -29,21 +30,30 @@ def with_unit(name: str, unit: str) -> str:
     return name if unit in ("", "1") else f"{name} ({unit})"
 
 
-def by_unit(whole: str, letter: str, units: Sequence[str]) -> list[Group]:
-    """Group the entries of a vector by their units: an axis has one.
+def by_unit(
+    whole: str, letter: str, units: Sequence[str], sizes: Sequence[float] | None = None
+) -> list[Group]:
+    """Group the entries of a vector by their units: an axis has one, of entries of one size.
 
     Args:
         whole: name of an axis that shows all entries, as ``state $x$``.
         letter: of an entry.
         units: of every entry, "" for none.
+        sizes: of every entry; those with a unit that differ tenfold have axes of their own.
     """
-    found: dict[str, list[int]] = {}
+    found: dict[tuple[str, int], list[int]] = {}
     for i, unit in enumerate(units):
-        found.setdefault(unit, []).append(i)
+        size, first = (sizes[i], 0) if sizes is not None and unit else (0.0, 0)
+        while (unit, first) in found and sizes is not None and size > 0:
+            other = sizes[found[unit, first][0]]
+            if max(size, other) < _APART * min(size, other) or not other > 0:
+                break
+            first += 1
+        found.setdefault((unit, first), []).append(i)
     if len(found) == 1:
         return [(with_unit(whole, units[0]), list(range(len(units))))]
     groups = []
-    for unit, entries in found.items():
+    for (unit, _), entries in found.items():
         names = [f"${letter}_{{{i + 1}}}$" for i in entries]
         short = ", ".join(names) if len(names) <= _NAMED else f"{names[0]} to {names[-1]}"
         groups.append((with_unit(short, unit), entries))
@@ -58,7 +68,8 @@ def draw_loop(picture: LoopPicture, width: object = None, font: object = None) -
     """
     thinned = slice(None, None, -(-len(picture.time) // _MOST_TIMES))
     time = picture.time[thinned]
-    states = by_unit("state $x$", "x", picture.state_units)
+    sizes = [_range(picture.state[..., i]) for i in range(len(picture.state_units))]
+    states = by_unit("state $x$", "x", picture.state_units, sizes)
     inputs = by_unit("control $u$", "u", picture.input_units) if picture.input_units else []
     with (
         printed_on(FigurePaper.chosen("LoopResult.figure", "", width, font)),
@@ -94,6 +105,11 @@ def draw_loop(picture: LoopPicture, width: object = None, font: object = None) -
             if 1 < len(axes.get_legend_handles_labels()[0]) <= _IN_A_LEGEND:
                 legend(axes)
     return figure
+
+
+def _range(values: np.ndarray) -> float:
+    """The largest size of an entry at any time in any row; 0 where none is a number."""
+    return float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
 
 
 def _of(values: np.ndarray | None, entries: list[int]) -> np.ndarray | None:

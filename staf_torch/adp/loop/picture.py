@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from ...lanes.row_numbers import some_rows
 from ...numerics.angles import wrap
 from ...numerics.checks import fail
 from ...results.pictures import LoopPicture
@@ -39,7 +40,7 @@ class LoopAbout:
     low: Tensor | None  # (m,) of the inputs; None for none at all
     high: Tensor | None
     cost: Cost | None = None  # around the plant
-    beside: Callable[[Tensor], LoopResult] | None = None  # the LQR's run from states (R, n)
+    beside: Callable[[Tensor, Tensor], LoopResult] | None = None  # the LQR's from (R, n), of rows (R,)
 
     @classmethod
     def of(
@@ -63,7 +64,13 @@ class LoopAbout:
         low, high = (None, None) if bounds is None else (bounds.low, bounds.high)
         itself = isinstance(controller, Feedback) and isinstance(controller.policy, LQR)
         plant = type(system.plant if isinstance(system, Clocked) else system).__name__
-        beside = None if itself else lambda x0: run(Feedback(LQR(system, cost, period)), x0)
+
+        def of_rows(x0: Tensor, rows: Tensor) -> LoopResult:
+            lqr = Feedback(LQR(system, cost, period))  # of all rows, where they have plants of their own
+            with some_rows(rows):
+                return run(lqr, x0)
+
+        beside = None if itself else of_rows
         facts = plant, controller.label, system.units, system.periodic, clock, low, high
         return cls(*facts, cost, beside)
 
@@ -139,6 +146,7 @@ def picture(result: LoopResult, rows: Sequence[int] | None, lqr: bool) -> LoopPi
     chosen = list(range(min(count, _DRAWN))) if rows is None else [int(row) for row in rows]
     if not chosen or not all(-count <= row < count for row in chosen):
         raise fail("LoopResult.figure", "rows", f"must be some of the {count} rows, from 0 on", rows)
+    chosen = [row % count for row in chosen]
     dim, inputs = result.state.shape[-1], result.control.shape[-1]
     units, words, clock, low, high = Units(), "", False, None, None
     if about is not None:
@@ -180,8 +188,9 @@ def _beside(result: LoopResult, row: int) -> tuple[Any, Any, Any] | None:
     if about is None or about.beside is None:
         return None
     try:
+        at = torch.tensor([row], device="cpu")
         with torch.no_grad():
-            return _arrays(about.beside(result.state[[row], 0]), [0])
+            return _arrays(about.beside(result.state[[row], 0], at), [0])
     except (ValueError, RuntimeError) as error:
         _log.warning("no LQR beside this loop: %s", str(error).partition("\n")[0])
         return None

@@ -7,6 +7,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from ...lanes.row_numbers import RowNumbers
+from ...numerics.checks import fail
 from ...numerics.default_device import device_of
 from ...numerics.row_checks import check_rows, is_ours
 from ...systems import ControlAffineSystem, Plant
@@ -28,6 +30,7 @@ def check_plant(plant: Plant) -> None:
     Raises:
         ValueError: that names the method and what it returned.
     """
+    _check_spread(plant)
     if plant.dim is None or isinstance(plant, FunctionPlant) or is_ours(type(plant)):
         return  # a function was tried when its plant was made
     name, x, u = type(plant).__name__, plant.equilibrium(), plant.resting_input()
@@ -36,6 +39,19 @@ def check_plant(plant: Plant) -> None:
         check_rows(f"{name}.effectiveness", plant.effectiveness, [x], (len(x), len(u)))
     else:
         check_rows(f"{name}.motion", plant.motion, [x, u], (len(x),))
+
+
+def _check_spread(plant: Plant) -> None:
+    """Refuse a ``spread`` of a plant that is several numbers, as one a coordinate.
+
+    Raises:
+        ValueError: that names it.
+    """
+    spread: object = plant.spread
+    if isinstance(spread, int | float | RowNumbers) or getattr(spread, "ndim", 1) == 0:
+        return
+    rule = "must be one number, for all coordinates: scale states of other sizes"
+    raise fail(type(plant).__name__, "spread", rule, spread)
 
 
 def check_cost(cost: Cost) -> None:

@@ -32,9 +32,9 @@ INFEASIBLE = 1e-6  # slack, in units of the input, from which on a row counts as
 _PASSES, _MOST = 2, 8  # linearisations at least, the first at the wanted control; at most, until all is met
 _SOLVED = 1e-6  # of what a wanted control misses, at which it is
 _OPPOSED = (
-    "`SafetyFilter`: braking along constraint %d drives the rest of the plant away, at %.3g 1/s near its "
-    "equilibrium (a coordinate that must first move the wrong way): %s. Plan instead: `AvoidanceCost` with "
-    "`RecedingHorizon`, see adp/safety/README.md."
+    "`SafetyFilter`: this filter may not keep constraint %s: %s. To keep it, plan instead: `AvoidanceCost` "
+    "with `RecedingHorizon`, see adp/safety/README.md. Why: braking along constraint %s drives the rest of "
+    "the plant away, at %s 1/s near its equilibrium (a coordinate that must first move the wrong way)."
 )
 _FOLLOWS = (
     "the policy is left alone wherever it stays inside by itself, and what it cannot keep is `infeasible`"
@@ -196,9 +196,10 @@ class SafetyFilter(Controller):
             self.work = _FOLLOWING if self.ahead.by_policy else (1.0 if self.conditions.apart else _BRAKING)
         self.follows, self.opposed = self.ahead.by_policy, self.ahead.opposed
         self.kinds = nn.ModuleList()
-        for k, rate in enumerate(self.ahead.against):
-            if bool(rate > 0):
-                _log.warning(_OPPOSED, k, float(of_first(rate)), _FOLLOWS if self.follows else _TOPPLES)
+        away = {k: float(of_first(rate)) for k, rate in enumerate(self.ahead.against) if bool(rate > 0)}
+        if away:
+            which, rates = ", ".join(map(str, away)), ", ".join(f"{rate:.3g}" for rate in away.values())
+            _log.warning(_OPPOSED, which, _FOLLOWS if self.follows else _TOPPLES, which, rates)
 
     @classmethod
     def of_kinds(cls, filters: Sequence[SafetyFilter], rows: Sequence[Tensor], count: int) -> SafetyFilter:
@@ -317,10 +318,12 @@ class SafetyFilter(Controller):
 
         Returns:
             ``minimum_margin``, the smallest h over rows and times; ``constraint_violations``, the number of
-            rows with h < 0 at a time; ``infeasible``, the rows that at a time were outside or that no
-            admissible control was found to keep inside; ``largest_slack``; ``acted``, the share of the steps
-            in which the control was another than the wanted one within the bounds; ``astray``, the rows in
-            which the policy was followed ahead, as braking along the edge drives the plant away.
+            rows with h < 0 at a time; ``violated``, these rows; ``infeasible``, the rows for which at some
+            time no admissible control was found that meets the conditions, which may still have kept h >= 0,
+            and those outside; ``largest_slack``; ``slack``, the largest of each row, (B,); ``acted``,
+            the share of the steps in which the control was another than the wanted one within the bounds;
+            ``astray``, the rows in which the policy was followed ahead, as braking along the edge drives the
+            plant away.
         """
         steps, least, most, acted, astray = (result[name][:, -1].detach() for name in Watched._fields[1:])
         last = self.margins(result.state[:, -1].detach(), steps * self.hold).amin(-1).detach()
@@ -328,8 +331,10 @@ class SafetyFilter(Controller):
         return {
             "minimum_margin": float(least.min()),
             "constraint_violations": int((least < 0).sum()),
+            "violated": (least < 0).nonzero().flatten().tolist(),
             "infeasible": ((most > INFEASIBLE) | (least < 0)).nonzero().flatten().tolist(),
             "largest_slack": float(most.max()),
+            "slack": most,
             "acted": float(acted.sum() / steps.sum()),
             "astray": (astray > 0).nonzero().flatten().tolist(),
         }
