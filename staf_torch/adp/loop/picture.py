@@ -188,7 +188,7 @@ def _beside(result: LoopResult, row: int) -> tuple[Any, Any, Any] | None:
     if about is None or about.beside is None:
         return None
     try:
-        at = torch.tensor([row], device="cpu")
+        at = torch.tensor([row], dtype=torch.int64, device="cpu")
         with torch.no_grad():
             return _arrays(about.beside(result.state[[row], 0], at), [0])
     except (ValueError, RuntimeError) as error:
