@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import logging
 import os
 import re
 import shutil
@@ -32,6 +33,8 @@ from .formats import Run, as_tuple
 from .names import check_count, check_dtype, function_name, listed_names
 from .remembered import RememberedPolicy
 from .sheet import Latency
+
+_log = logging.getLogger(__name__)
 
 
 @Sign("export to C")
@@ -75,14 +78,29 @@ def export_c(
     name = function_name("export_c", name, module, ["state", *outputs])
     checked_names("export_c", "outputs", outputs, ["state"])
     check_dtype("export_c", module, example)
+    filters = [part for part in module.modules() if isinstance(part, FilteredPolicy)]
+    ahead = any(part.filter.follows for part in filters)
     if isinstance(module, RememberedPolicy) or searches(module):
         check_count("export_c", outputs, 1)
         body, source, compared = _searching(module, example[:1], name, outputs[0])
         said = _said(note, source, f"compares {compared} states and takes at most")
         path.write_text(commented(said) + guarded(name, body), encoding="utf-8")
-        return source
+        return _warned(source, path, ahead)
     program = Program(lambda carry, now, row: (carry, as_tuple(module(row["state"]))), name="the header")
-    return _write(path, program, (), {"state": example[:1]}, name, outputs, note)
+    return _warned(_write(path, program, (), {"state": example[:1]}, name, outputs, note), path, ahead)
+
+
+def _warned(source: Source, path: Path, ahead: bool) -> Source:
+    """What a header costs; with a line in the log where a filter in it follows its policy ahead."""
+    if ahead:
+        _log.warning(
+            "%s has a filter that follows its policy ahead at some states: a call there can take all of its "
+            "%d additions and the like and %d calls of exp and the like, far more than most calls take.",
+            path.name,
+            source.flops,
+            source.functions,
+        )
+    return source
 
 
 @Sign("export to C")
