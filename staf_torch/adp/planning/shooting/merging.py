@@ -75,10 +75,10 @@ def merged(found: Optimum, rows: Tensor, several: list[Optimum]) -> Optimum:
         else:
             most, least = max(finite), min(finite)
             others = f"up to {most / least:.7g} times as much" if least > 0 else f"{least:.4g} to {most:.4g}"
-            same = least > 0 and most <= least * (
+            alike = least > 0 and most <= least * (
                 1 + _SAME
             )  # no number: others ended in the same, unfinished
-            local = f"{_LONE} found it" + ("" if same else f", others {others}")
+            local = f"{_LONE} found it" + ("" if alike else f", others {others}")
             own = every[int(best[place])].reason[place]
             lone = not own or own.startswith(_LONE)
             reasons[row] = "" if bool(converged[row]) else local if lone else f"local: {own}"
