@@ -268,10 +268,11 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         outputs = () if self.n_outputs_ is None else (self.n_outputs_,)
         given = f"{tuple(x.shape)}" + ("" if y is None else f" and y's {tuple(y.shape)}")
         name = type(self).__name__
+        width = f": X has {x.shape[-1]} features, but {name} is expecting {self.n_features_in_} features as input"
+        other = width if x.shape[-1:] != self._shape_[-1:] else ""
         return ValueError(
             f"`{name}.{call}(x=...)` must have the shape {self._shape_} of the first sample, with "
-            f"{self.n_features_in_} features, and y {(*self._shape_[:-1], *outputs)}; got the shape {given}: "
-            f"X has {x.shape[-1]} features, but {name} is expecting {self.n_features_in_} features as input."
+            f"{self.n_features_in_} features, and y {(*self._shape_[:-1], *outputs)}; got the shape {given}{other}."
         )
 
     def reset(self, streams: Any = None) -> Self:
