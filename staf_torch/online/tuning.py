@@ -340,7 +340,8 @@ def _warn(covered: Tensor, width: Tensor, wider: Tensor) -> None:
         told = ", which is that of the others: it says nothing of its own" if wider[stream, k] else ""
         _log.warning(
             "`StaFRegressor.tune`: coordinate %d of stream %d covers %.2g of a width (%.3g) in this stretch%s"
-            "; %d coordinate(s) in all cover less than %.2g. Tune where they move, if they ever do",
+            "; %d coordinate(s) in all cover less than %.2g. Either y is nearly linear in them, and there is "
+            "nothing to do, or they hardly moved: tune where they move",
             *(k, stream, covered[stream, k], width[stream, k], told, int((covered < most).sum()), most),
         )
 
