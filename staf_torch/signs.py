@@ -31,6 +31,7 @@ FIRST, EVERY = 1.5, 10.0
 """s before anything is shown, and from a line to the next."""
 _LOOK = 0.25  # s
 _BAR = 24  # characters
+_TELLING = 0.05  # share done, from which the time left is told
 _open: dict[int, list[Sign]] = {}  # of each thread, from the outermost call in
 _lock = threading.RLock()
 _mine = threading.local()
@@ -113,7 +114,9 @@ class Sign:
         if not 0 < share < 1:
             return what
         left = (time.monotonic() - self._began) * (1 - share) / share
-        far = f"{100 * share:.0f} % of {self.total:g} {self.unit}, {left:.0f} s left"
+        far = f"{100 * share:.0f} % of {self.total:g} {self.unit}"
+        if share >= _TELLING:  # before, most of the time went into compiling and loading
+            far += f", {left:.0f} s left"
         return f"{what}: {far}" if what else far
 
 
