@@ -268,7 +268,9 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         outputs = () if self.n_outputs_ is None else (self.n_outputs_,)
         given = f"{tuple(x.shape)}" + ("" if y is None else f" and y's {tuple(y.shape)}")
         name = type(self).__name__
-        width = f": X has {x.shape[-1]} features, but {name} is expecting {self.n_features_in_} features as input"
+        width = (
+            f": X has {x.shape[-1]} features, but {name} is expecting {self.n_features_in_} features as input"
+        )
         other = width if x.shape[-1:] != self._shape_[-1:] else ""
         return ValueError(
             f"`{name}.{call}(x=...)` must have the shape {self._shape_} of the first sample, with "
