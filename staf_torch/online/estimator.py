@@ -274,7 +274,8 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         other = width if x.shape[-1:] != self._shape_[-1:] else ""
         return ValueError(
             f"`{name}.{call}(x=...)` must have the shape {self._shape_} of the first sample, with "
-            f"{self.n_features_in_} features, and y {(*self._shape_[:-1], *outputs)}; got the shape {given}{other}."
+            f"{self.n_features_in_} features, and y {(*self._shape_[:-1], *outputs)}; "
+            f"got the shape {given}{other}."
         )
 
     def reset(self, streams: Any = None) -> Self:
