@@ -103,13 +103,14 @@ def test_samples_of_another_shape_are_refused_and_leave_the_streams_alone(kind: 
             with pytest.raises(ValueError, match=r"Regressor.partial_fit\(x=...\)` must have") as told:
                 model.partial_fit(x, y)
             kept = f"the shape {of_x} of the first sample, with {of_x[-1]} features, and y {of_y}"
-            given = f"got the shape {other_x} and y's {other_y}: X has {other_x[-1]} features, but"
+            far = f": X has {other_x[-1]} features, but" if other_x[-1] != of_x[-1] else "."
+            given = f"got the shape {other_x} and y's {other_y}{far}"
             assert kept in str(told.value)
             assert given in str(told.value)
             if other_x != of_x and len(other_x) <= len(of_x):  # one more is of several points
                 with pytest.raises(ValueError, match=r"predict\(x=...\)` must have the shape") as told:
                     model.predict(x)
-                assert f"got the shape {other_x}: X has {other_x[-1]} features" in str(told.value)
+                assert f"got the shape {other_x}{far[:1]}" in str(told.value)
         points = (*of_x[:-1], 5, of_x[-1])
         assert model.predict(torch.zeros(points)).shape == (*of_x[:-1], 5, *of_y[len(of_x) - 1 :])
         for other in ((*points[:-1], 4), (7, *points)):
