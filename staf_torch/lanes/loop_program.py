@@ -13,6 +13,7 @@ from .compiled_methods import methods_of
 from .plain_time import PlainTime, RepaysError
 from .program import Program
 from .row_independence import generators
+from .row_numbers import one_by_one
 from .tree import Tree
 
 _log = logging.getLogger(__name__)
@@ -50,27 +51,29 @@ class LoopProgram:
         self._sign = Sign(f"{plain.name} in plain torch", times)
         self._done, self._spent, self._fastest, self._said = 0, 0.0, math.inf, False
         self._parts, self._waited = parts, False
+        self._counted = 0  # rows, one after the other, of which a step was counted
 
     def __call__(
         self, carry: Tree, now: Tree = (), row: Tree = (), *, steps: int | None = None, every: int = 1
     ) -> tuple[Tree, Tree]:
         """The carry after the last step, and the outputs, as of a `Program`."""
         if self._compiled is None:
-            put_back = generators() if not self._done else None
+            put_back = generators()
             try:
                 with self._sign:
                     return self._plain(carry, now, row, steps=steps, every=every)
             except RepaysError:
                 assert self._make is not None
-                assert put_back is not None
                 put_back()
                 self._compiled = self._make()
         return self._compiled(carry, now, row, steps=steps, every=every)
 
     def _timed(self, carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
         start = time.perf_counter()
-        if self._make is not None and not self._done and self._times >= _FEW:
-            with PlainTime(self._times) as plain:
+        rows = one_by_one()
+        if self._make is not None and rows > self._counted and self._times * rows >= _FEW:
+            self._counted = rows
+            with PlainTime(self._times * rows) as plain:
                 found = self._step(carry, now, row)
             plain.refuse()
         else:
@@ -90,11 +93,11 @@ class LoopProgram:
         if waited or self._waited:  # or in the step after the last one was compiled
             self._fastest = math.inf
             return
-        rest = self._fastest * (self._times - self._done)
+        rest = self._fastest * (self._times * one_by_one() - self._done)
         if rest < _LONG:
             return
         self._said = True
         _log.warning(
             "%s: %d of %d steps took %.1f s in plain torch, the rest takes some %.0f s%s",
-            *(self._plain.name, self._done, self._times, self._spent, rest, self._remedy),
+            *(self._plain.name, self._done, self._times * one_by_one(), self._spent, rest, self._remedy),
         )

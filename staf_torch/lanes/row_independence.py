@@ -19,6 +19,7 @@ from torch import Tensor
 
 from .call import Given
 from .loops import few_passes
+from .plain_time import RepaysError
 from .row_numbers import over_rows, some_rows
 from .tree import Shared, Tree, flatten, plain, unflatten
 
@@ -48,6 +49,8 @@ def doubt(step: Callable[..., Any], given: Given, *, again: bool = True) -> str 
             return None
         try:
             both = _called(step, given, [first, other])
+        except RepaysError:  # the loop around it takes longer than a compiler
+            raise
         except Exception as error:  # which plain torch will raise again, for all rows
             return f"takes one row but not two: {type(error).__name__}: {error}"
         for row, at in ((first, 0), (other, 1)):

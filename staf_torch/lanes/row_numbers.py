@@ -344,6 +344,12 @@ def over_some_rows(function: Callable[..., Some], chosen: Tensor, *given: Tree) 
         return over_rows(function, *given)
 
 
+def one_by_one() -> int:
+    """Return how many rows run one after the other here, as they decide by values; else 1."""
+    apart: int = getattr(_active, "apart", 1)
+    return apart
+
+
 def _refuse(numbers: RowNumbers) -> Tensor:
     raise RowsMetError(numbers)
 
@@ -377,10 +383,14 @@ def _mapped(function: Callable[..., Some], given: tuple[Tree, ...], met: RowNumb
     except (RuntimeError, ValueError) as error:
         if not _decides(error):
             raise
-        each = []
-        for index in indices:
-            with some_rows(index.view(1)):  # of compiled calls inside
-                each.append(one(index, *(leaf[int(index)] for leaf in own)))
+        each, before = [], one_by_one()
+        _active.apart = before * count
+        try:
+            for index in indices:
+                with some_rows(index.view(1)):  # of compiled calls inside
+                    each.append(one(index, *(leaf[int(index)] for leaf in own)))
+        finally:
+            _active.apart = before
         found = tuple(torch.stack(column) for column in zip(*each, strict=True))
     some: Some = unflatten(shape, iter(found))
     return some
