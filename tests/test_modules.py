@@ -212,7 +212,7 @@ MODULES: dict[str, Case] = {
     "FoldedRollout": Case(lambda s: FoldedRollout(rollout(s))),
 }
 OTHERS = {
-    *("KeptPrecision", "FunctionPlant", "StepPlant", "RatePlant", "SampledProblem"),
+    *("KeptPrecision", "FunctionPlant", "StepPlant", "RatePlant", "SampledProblem", "ControllerOfKinds"),
     *(
         "GlobalValue",
         "BoxFilter",

@@ -148,17 +148,28 @@ def homogeneous(directions: Tensor, degree: int) -> Tensor:
     return _monomials(directions, _exponents(directions.shape[-1], degree))
 
 
-@functools.lru_cache(maxsize=256)
 def _exponents(dim: int, degree: int) -> tuple[tuple[int, ...], ...]:
     """Return `exponents` as numbers."""
+    # torch.compile warns of a cache that it does not see.
+    return (_exponents_of if torch.compiler.is_compiling() else _kept_exponents)(dim, degree)
+
+
+def _exponents_of(dim: int, degree: int) -> tuple[tuple[int, ...], ...]:
     return tuple(map(tuple, exponents(dim, degree).tolist()))
 
 
-@functools.lru_cache(maxsize=256)
 def _scales(alpha: tuple[tuple[int, ...], ...]) -> tuple[float, ...]:
     """sqrt(k! / alpha!), k = |alpha|, of each."""
+    return (_scales_of if torch.compiler.is_compiling() else _kept_scales)(alpha)
+
+
+def _scales_of(alpha: tuple[tuple[int, ...], ...]) -> tuple[float, ...]:
     factorials = [math.prod([math.factorial(a) for a in row]) for row in alpha]
     return tuple(math.sqrt(math.factorial(sum(row)) / x) for row, x in zip(alpha, factorials, strict=True))
+
+
+_kept_exponents = functools.lru_cache(maxsize=256)(_exponents_of)
+_kept_scales = functools.lru_cache(maxsize=256)(_scales_of)
 
 
 def _monomials(points: Tensor, alpha: tuple[tuple[int, ...], ...]) -> Tensor:

@@ -261,23 +261,23 @@ class Reverse:
         held = len(loop.collected) - len(loop.carry)
         arrays_before = [collected(graph, here, held + k) for k in range(len(loop.carry))]
         first = len(graph.op)
-        befores = [
+        earlier = [
             graph.add("load", (array,), graph.type[array], (number, last, -1), depth)
             for array in arrays_before
         ]
-        after, made = self._step.body(self._step.kept[node], number, befores, back=True)
+        after, made = self._step.body(self._step.kept[node], number, earlier, back=True)
         moving = [self._is_active(x) or k in ends for k, x in enumerate(loop.initial)]
         while True:  # which numbers of the carry have slopes
             del self._active[first:]
             self._active += [False] * (first - len(self._active))
-            for x, one in zip(befores, moving, strict=True):
+            for x, one in zip(earlier, moving, strict=True):
                 self._active.append(one and graph.type[x] == REAL)
             self._depend()
             more = [one or self._is_active(x) for one, x in zip(moving, after, strict=True)]
             if more == moving:
                 break
             moving = more
-        moving = [one and graph.type[x] == REAL for one, x in zip(moving, befores, strict=True)]
+        moving = [one and graph.type[x] == REAL for one, x in zip(moving, earlier, strict=True)]
         end = len(self._active)
         places = [k for k, one in enumerate(moving) if one]
         slopes = [graph.add("carry", (), REAL, (number, j), depth) for j in range(len(places))]
@@ -294,11 +294,11 @@ class Reverse:
             graph.add("carry", (), REAL, (number, len(slopes) + j), depth) for j in range(len(around))
         ]
         back.initial = [ends.get(k, self._zero) for k in places] + [self._zero] * len(around)
-        back.following = [self._slope.get(befores[k], self._zero) for k in places]
+        back.following = [self._slope.get(earlier[k], self._zero) for k in places]
         sums = zip(back.carry[len(slopes) :], around.values(), strict=True)
         back.following += [graph.apply("add", total, slope) for total, slope in sums]
         fed = [
-            k for k in range(first, end) if graph.op[k] == "load" and k in self._slope and k not in befores
+            k for k in range(first, end) if graph.op[k] == "load" and k in self._slope and k not in earlier
         ]
         back.collected = [[self._slope[k]] for k in fed]
         factors = self._factors(back, arrays)
