@@ -152,7 +152,7 @@ def cross_polytope(dim: int) -> Tensor:
     return torch.stack((axes, -axes), dim=1).reshape(2 * dim, dim)
 
 
-@Sign("ball")
+@Sign("a layout of centers in a ball")
 def ball(count: int, dim: int) -> Tensor:
     """Approximate Fekete points of the closed unit ball.
 

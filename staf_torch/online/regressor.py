@@ -27,7 +27,7 @@ from .local_functions import LocalFunctions
 from .own_functions import NAMES, OwnFunctions, has_rows, own_functions, own_law
 from .samples import lapses, like_given, pair, single, tensor_of
 from .smoothing import smooth_record
-from .tuning import Tuning, tuned_streams, tuning
+from .tuning import CENTERS, Tuning, tuned_streams, tuning
 from .turning_streams import TurningStreams, turned_in_time
 
 _log = logging.getLogger(__name__)
@@ -147,7 +147,7 @@ class StaFRegressor(StreamEstimator):
                 finds more likely hyperparameters and takes longer from three coordinates on.
 
         Raises:
-            ValueError: if a shape is another one, or the method.
+            ValueError: if a shape is another one, or the method; `gradient` serves up to 15 centers.
         """
         choice(f"{_NAME}.tune", "method", method, ("search", "gradient"))
         states, values = pair(f"{_NAME}.tune", x, y, (2, 3))
@@ -155,7 +155,14 @@ class StaFRegressor(StreamEstimator):
         targets = values if values.dim() == states.dim() else values.unsqueeze(-1)
         rows = [part.unsqueeze(1) if states.dim() == 2 else part for part in (states, targets)]
         with on(states.device):
-            found = tuning(rows[0], rows[1], self._directions(states.shape[-1]), method)
+            directions = self._directions(states.shape[-1])
+            if method == "gradient" and len(directions) > CENTERS:
+                rule = f"must be 'search' for more than {CENTERS} centers, of which {states.shape[-1]} "
+                rule += (
+                    f"coordinates take {len(directions)}: a compiler takes minutes for the stretch's program"
+                )
+                raise fail(f"{_NAME}.tune", "method", rule, method)
+            found = tuning(rows[0], rows[1], directions, method)
         self._change(self._hold, found)
         return self
 

@@ -34,6 +34,7 @@ ROUNDS = (0.6, 0.3)  # spread of the logarithms of the candidates around the bes
 AROUND = 48  # of these candidates a round
 STARTS = 2  # of the grid, from which the gradient goes up
 STEPS = 16  # that it takes
+CENTERS = 15  # of which the program of a stretch is compiled in seconds
 LENGTH = 0.5  # of the first of them, in logarithms; the last is a sixteenth of it
 MEMORY = (0.5, 0.8)  # of Adam's means: steps are few
 FADES, LEAST_NOISE = (1e-4, 0.2), 1e-5  # what is forgotten between samples, and the noise, lie beyond

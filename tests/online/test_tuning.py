@@ -94,6 +94,9 @@ def test_the_gradient_finds_what_is_at_least_as_likely_as_the_best_of_the_search
     torch.testing.assert_close(alone.likelihood, ascended[1:])
     with pytest.raises(ValueError, match=r"tune\(method=...\)` must be one of .*; got 'newton'"):
         st.StaFRegressor().tune(x, y, method="newton")
+    wide = torch.randn(50, 7, dtype=torch.float64)
+    with pytest.raises(ValueError, match="'search' for more than 15 centers, of which 7 coordinates take 36"):
+        st.StaFRegressor().tune(wide, wide[:, 0], method="gradient")
 
 
 def test_a_mixture_has_nothing_to_tune() -> None:
