@@ -122,7 +122,7 @@ def test_a_sweep_is_that_of_the_command_and_shows_nothing(
         (["centers.radius=-1"], "must be positive; got -1"),
         (["centers.radios=1"], "there is no setting `centers.radios`"),
         (["kernel=gauss"], "there is no `kernel/gauss`; there are anchored"),
-        (["centers.radius=0.1,0.2"], "Ambiguous value"),
+        (["centers.radius=0.1,0.2"], "a list is a sweep"),
         (["experiment=ablation"], "call `staf_torch.sweep`"),
         (["target.path=nowhere.function", "target=custom"], "nowhere"),
     ],

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ...lanes.gradients import without_gradient
 from ...lanes.opaque import opaque
+from ...lanes.row_numbers import some_rows
 from ...lanes.row_objects import refuse_rows
 from ...numerics.checks import fail, integer, real
 from ...signs import Sign
@@ -149,7 +150,8 @@ def best_from(memory: GlobalValue, search: BoxDDP, x: Tensor, own: Tensor | None
         own: a trajectory for each state that must not help it, (B,).
     """
     guesses = _guesses(memory, search.steps, x, own)
-    found = search.solve(x[guesses.owner], guesses.control, guesses.reference)
+    with some_rows(guesses.owner):
+        found = search.solve(x[guesses.owner], guesses.control, guesses.reference)
     order = found.cost.argsort(descending=True, stable=True)
     best = torch.empty(len(x), dtype=torch.int64, device=x.device)
     best[guesses.owner[order]] = order  # the last one written is the cheapest

@@ -320,7 +320,7 @@ class SafetyFilter(Controller):
             ``minimum_margin``, the smallest h over rows and times; ``constraint_violations``, the number of
             rows with h < 0 at a time; ``violated``, these rows; ``infeasible``, the rows for which at some
             time no admissible control was found that meets the conditions, which may still have kept h >= 0,
-            and those outside; ``largest_slack``; ``slack``, the largest of each row, (B,); ``acted``,
+            and those outside; ``largest_slack``; ``slack``, the largest of each row; ``acted``,
             the share of the steps in which the control was another than the wanted one within the bounds;
             ``astray``, the rows in which the policy was followed ahead, as braking along the edge drives the
             plant away.
@@ -334,7 +334,7 @@ class SafetyFilter(Controller):
             "violated": (least < 0).nonzero().flatten().tolist(),
             "infeasible": ((most > INFEASIBLE) | (least < 0)).nonzero().flatten().tolist(),
             "largest_slack": float(most.max()),
-            "slack": most,
+            "slack": most.tolist(),
             "acted": float(acted.sum() / steps.sum()),
             "astray": (astray > 0).nonzero().flatten().tolist(),
         }

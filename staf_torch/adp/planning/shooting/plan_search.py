@@ -7,6 +7,7 @@ import logging
 
 from torch import Tensor
 
+from ....lanes.row_numbers import some_rows
 from ....systems import Plant
 from ...problem.cost import Cost
 from ...problem.sampled import SampledProblem
@@ -58,7 +59,8 @@ class PlanSearch:
         if self.problem.dim > _REMEMBERED or not self.problem.endless:
             return None
         try:
-            return global_value_of(self.problem, self.width, self.steps)
+            with some_rows(None):  # its states are its own, and none of those that are planned from
+                return global_value_of(self.problem, self.width, self.steps)
         except ValueError as error:
             _log.info("direct shooting begins without a memory: %s", str(error).splitlines()[0])
             return None
