@@ -208,24 +208,28 @@ def lorenzes(rows: int, dtype: torch.dtype) -> Case:
     return of_program(lanes.Program(lorenz), x0, (), rho, steps=1000, times=1000)
 
 
-def information(rows: int, dtype: torch.dtype) -> Case:
+def learning(rows: int, dtype: torch.dtype) -> tuple[Any, Any, Any, Tensor]:
+    """The learner of the paper's example, its plant, cost and first states."""
     plant, cost = systems.TwoState(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
     following = st.StateFollowingCenters(st.rings(3), st.StateRadius(0.7, 1e-5))
     basis = adp.StaFValueBasis(st.StaFBasis(st.AnchoredKernel(st.ExponentialKernel()), following))
     points = adp.RandomPoints(1, st.StateRadius(2.1, 1e-5))
     learner = adp.ActorCritic(basis, plant, cost, points, adp.Information())
-    x0 = torch.tensor([-1.0, 1.0], dtype=dtype) + 0.1 * torch.randn(rows, 2, dtype=dtype)
-    return of_loop(learner, plant, cost, x0, 100, dt=1e-3)
+    return (
+        learner,
+        plant,
+        cost,
+        torch.tensor([-1.0, 1.0], dtype=dtype) + 0.1 * torch.randn(rows, 2, dtype=dtype),
+    )
+
+
+def information(rows: int, dtype: torch.dtype) -> Case:
+    return of_loop(*learning(rows, dtype), 100, dt=1e-3)
 
 
 def random_points(rows: int, dtype: torch.dtype) -> Case:
     """The same learner as a user calls it: its points are made where it runs, by seed, row and step."""
-    plant, cost = systems.TwoState(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
-    following = st.StateFollowingCenters(st.rings(3), st.StateRadius(0.7, 1e-5))
-    basis = adp.StaFValueBasis(st.StaFBasis(st.AnchoredKernel(st.ExponentialKernel()), following))
-    points = adp.RandomPoints(1, st.StateRadius(2.1, 1e-5))
-    learner = adp.ActorCritic(basis, plant, cost, points, adp.Information())
-    x0 = torch.tensor([-1.0, 1.0], dtype=dtype) + 0.1 * torch.randn(rows, 2, dtype=dtype)
+    learner, plant, cost, x0 = learning(rows, dtype)
 
     def call(x0: Tensor) -> Any:
         found = adp.simulate(learner, plant, cost, x0, dt=1e-3, steps=100, every=10)

@@ -284,3 +284,14 @@ def test_without_its_generator_the_extra_is_named(monkeypatch: pytest.MonkeyPatc
         build.main([])
     with pytest.raises(ValueError, match=r"takes rooms of .*; got 'b'"):
         build.main(["a", "b"])
+
+
+@pytest.mark.parametrize("name", ["latest/mine.txt", "0.2/index.html", "index.html"])
+def test_nothing_but_an_earlier_site_is_replaced(name: str, tmp_path: Path) -> None:
+    pytest.importorskip("mkdocstrings")
+    own = tmp_path / name
+    own.parent.mkdir(exist_ok=True)
+    own.write_text("mine")
+    with pytest.raises(ValueError, match="takes the place of an earlier site alone"):
+        build.main([str(tmp_path)])
+    assert own.read_text() == "mine"

@@ -13,6 +13,7 @@ import importlib.util
 import json
 import logging
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Sequence
@@ -25,6 +26,8 @@ from .names import PACKAGE, ROOMS
 from .pages import manuals, write_pages
 
 _HERE = Path(__file__).resolve().parent
+_HEAD = '<!doctype html><meta charset="utf-8"><title>staf_torch</title>'
+"""Of pages that lead to others."""
 _NEEDED = ("mkdocs", "material", "mkdocstrings", "mkdocstrings_handlers")
 
 
@@ -38,7 +41,8 @@ def main(words: Sequence[str]) -> str:
         words: the folder, then the rooms that get reference pages, all of `ROOMS` by default.
 
     Raises:
-        ValueError: without the extra `docs`, for a room that has no pages, or if the generator warns.
+        ValueError: without the extra `docs`, for a room that has no pages, where a site would take the place
+            of something else, or if the generator warns.
     """
     rooms = tuple(words[1:]) or tuple(ROOMS)
     if unknown := [room for room in rooms if room not in ROOMS]:
@@ -52,6 +56,11 @@ def main(words: Sequence[str]) -> str:
         )
     folder = Path(words[0] if words else "site").resolve()
     version = ".".join(__version__.split(".")[:2])
+    if others := [place for place in (version, "latest", "index.html") if not _replaceable(folder / place)]:
+        raise ValueError(
+            f"`staf docs FOLDER` takes the place of an earlier site alone, and {folder / others[0]} is none: "
+            "name another folder."
+        )
     with tempfile.TemporaryDirectory() as scratch:
         write_pages(Path(scratch) / "docs", rooms)
         (Path(scratch) / "docs" / "versions.js").touch()  # of all versions, when this one is there
@@ -60,6 +69,21 @@ def main(words: Sequence[str]) -> str:
         _build(Path(scratch), folder / version, rooms)
     _lead_to(folder, version)
     return f"site: {folder / 'index.html'}"
+
+
+def _replaceable(place: Path) -> bool:
+    """Return whether nothing is there, or what an earlier call wrote."""
+    if place.is_symlink() or (place.exists() and place.is_dir() == (place.suffix == ".html")):
+        return False
+    if place.is_dir():
+        marks = [place / "versions.js", place / "index.html"]
+        return not any(place.iterdir()) or marks[0].is_file() or _leads_on(marks[1])
+    return not place.exists() or _leads_on(place)
+
+
+def _leads_on(page: Path) -> bool:
+    """Return whether a page is one of `_redirect`."""
+    return page.is_file() and page.read_bytes().startswith(_HEAD.encode())
 
 
 def _build(scratch: Path, folder: Path, rooms: Sequence[str]) -> None:
@@ -188,7 +212,8 @@ def _lead_to(folder: Path, version: str) -> None:
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_text(_redirect(f"{up}{version}/{place}"), encoding="utf-8")
     (folder / "index.html").write_text(_redirect(f"{version}/index.html"), encoding="utf-8")
-    versions = {path.parent.parent.name for path in folder.glob("*/search/search_index.js")}
+    places = (path.parent.parent.name for path in folder.glob("*/search/search_index.js"))
+    versions = {place for place in places if re.fullmatch(r"[0-9]+(\.[0-9]+)*", place)}
     order = sorted(versions, key=lambda each: [int(part) for part in each.split(".")], reverse=True)
     for each in versions:
         (folder / each / "versions.js").write_text(
@@ -198,7 +223,4 @@ def _lead_to(folder: Path, version: str) -> None:
 
 def _redirect(target: str) -> str:
     there = html.escape(target)
-    return (
-        f'<!doctype html><meta charset="utf-8"><title>staf_torch</title>'
-        f'<meta http-equiv="refresh" content="0; url={there}"><a href="{there}">{there}</a>\n'
-    )
+    return f'{_HEAD}<meta http-equiv="refresh" content="0; url={there}"><a href="{there}">{there}</a>\n'

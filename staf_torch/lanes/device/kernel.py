@@ -156,7 +156,9 @@ class DeviceCall:
                 None if room is None else empty(room[0], room[1], dtype=room[2], device=where)
                 for room in self._rooms
             ]
-        except RuntimeError as error:
+        except RuntimeError as error:  # of an earlier kernel, too, which is told as it is
+            if not isinstance(error, torch.OutOfMemoryError) and "allocate memory" not in str(error):
+                raise
             raise type(error)(self._too_large()) from error
         addresses = [0 if room is None else room.data_ptr() for room in rooms]
         with self._lock:  # the driver copies the structure when it is called
