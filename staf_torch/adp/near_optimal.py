@@ -41,6 +41,7 @@ _DECAY = 2.0  # time constants of the slowest mode of the LQR in the horizon
 _TRIES, _PATIENCE = 8, 1.0  # controls, and s, after which a simulator is called slow
 _SHARE = 0.5  # of a period that a control may take without a warning: another half for a slower moment
 _Given = tuple[Plant, Cost, Limit, Limit, float]
+"""Arguments that may hold numbers of rows: plant, cost, low, high, radius."""
 _WAYS = ("auto", "local", "global")
 
 
@@ -126,17 +127,14 @@ def near_optimal(
     """
     choice("near_optimal", "reach", reach, _WAYS)
 
-    def local(plant: Plant, cost: Cost, low: Limit, high: Limit, radius: float) -> NearOptimal:
-        return _local(plant, cost, dt, low, high, radius, horizon, plan, substeps)
-
     def single(given: _Given) -> NearOptimal:
-        policy = local(*given)
+        policy = _local(given, dt, horizon, plan, substeps)
         if reach != "local":
             policy.reach, policy.memory = extended(policy, policy.lqr, policy.box, policy.settles, reach)
         return policy
 
     def looked_at() -> tuple[NearOptimal, Reach | None]:
-        policy = local(*given)
+        policy = _local(given, dt, horizon, plan, substeps)
         if reach != "auto":
             return policy, policy.reach if reach == "local" else None
         decay = slowest(policy.lqr, plant, policy.cost, policy.period)
@@ -163,17 +161,10 @@ def near_optimal(
 
 
 def _local(
-    plant: Plant,
-    cost: Cost,
-    dt: float | None,
-    low: Limit,
-    high: Limit,
-    radius: float,
-    horizon: float | None,
-    plan: bool,
-    substeps: int | None,
+    given: _Given, dt: float | None, horizon: float | None, plan: bool, substeps: int | None
 ) -> NearOptimal:
     """Return the local policy; arguments as those of `near_optimal`."""
+    plant, cost, low, high, radius = given
     period = held_period("near_optimal", plant, dt)
     check_still("near_optimal", "plant", plant, "`RecedingHorizon` or `LQR`")
     check_endless("near_optimal", "cost", cost.ending, "the policy knows no end; plans do, `RecedingHorizon`")
