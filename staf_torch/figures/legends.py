@@ -144,6 +144,8 @@ def _lengthen(axes: Axes, share: float) -> None:
     scale, ends = axes.yaxis.get_transform(), axes.get_ylim()
     low, high = scale.transform(np.array(ends))
     ticks = [tick for tick in axes.get_yticks() if ends[0] <= tick <= ends[1]]
+    small = [tick for tick in axes.get_yticks(minor=True) if ends[0] <= tick <= ends[1]]
     axes.set_yticks(ticks)
+    axes.set_yticks(small, minor=True)  # else those of the room above stand there without a number
     top = low + (high - low) / (1 - share)
     axes.set_ylim(ends[0], float(scale.inverted().transform(np.array([top]))[0]))
