@@ -68,9 +68,12 @@ def held_period(call: str, plant: Plant, dt: float | None) -> float:
     """Return the time for which a control is held, s: ``dt``, by default a step of a plant in discrete time.
 
     Raises:
-        ValueError: if it is not positive.
+        ValueError: if it is not positive, or nobody says it.
     """
-    return positive_real(call, "dt", plant.period if dt is None else dt)
+    period = plant.period if dt is None else dt
+    if period is None:
+        raise fail(call, "dt", "must be given, s: a plant in continuous time has no period of its own", dt)
+    return positive_real(call, "dt", period)
 
 
 def own_period(call: str, plant: Plant, dt: float | None) -> float:
