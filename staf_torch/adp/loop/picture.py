@@ -120,7 +120,7 @@ def _ranges(letter: str, values: Tensor, units: Sequence[str]) -> str:
     low = torch.where(flat.isnan(), torch.inf, flat).amin(0).tolist()
     high = torch.where(flat.isnan(), -torch.inf, flat).amax(0).tolist()
     words = [
-        f"{letter}{i + 1} {a:.3g} to {b:.3g} {unit}".rstrip() if a <= b else f"{letter}{i + 1} nowhere"
+        f"{letter}{i + 1} {a + 0.0:.3g} to {b + 0.0:.3g} {unit}".rstrip() if a <= b else f"{letter}{i + 1} nowhere"
         for i, (a, b, unit) in enumerate(zip(low, high, units, strict=True))
     ]
     more = f", ... {letter}{len(words)}" if len(words) > _NAMED else ""
