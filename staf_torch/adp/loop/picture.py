@@ -117,10 +117,11 @@ def _numbers(values: Tensor) -> str:
 def _ranges(letter: str, values: Tensor, units: Sequence[str]) -> str:
     """Return the least and the largest number of each entry, (..., k)."""
     flat = values.reshape(-1, values.shape[-1]).cpu()
+    flat = torch.where(flat == 0, 0.0, flat)  # not -0
     low = torch.where(flat.isnan(), torch.inf, flat).amin(0).tolist()
     high = torch.where(flat.isnan(), -torch.inf, flat).amax(0).tolist()
     words = [
-        f"{letter}{i + 1} {a + 0.0:.3g} to {b + 0.0:.3g} {unit}".rstrip() if a <= b else f"{letter}{i + 1} nowhere"
+        f"{letter}{i + 1} {a:.3g} to {b:.3g} {unit}".rstrip() if a <= b else f"{letter}{i + 1} nowhere"
         for i, (a, b, unit) in enumerate(zip(low, high, units, strict=True))
     ]
     more = f", ... {letter}{len(words)}" if len(words) > _NAMED else ""
