@@ -12,10 +12,10 @@ from torch import Tensor
 
 from ..lanes import Program
 from ..lanes.call import form, ordinary
-from ..lanes.compiled_methods import worth
 from ..lanes.contents import is_users
 from ..lanes.device.kernel import DeviceCall
 from ..lanes.tree import flatten, unflatten
+from ..lanes.when_compiled import worth
 from .problem import Problem
 from .quantities import Numbers
 from .recursion import last_weights, start
@@ -65,7 +65,7 @@ class Repeated:
         """Return what the program leaves behind at states of this form, None where more is to be done."""
         if (
             self.plan is None
-            or not worth(states.shape[1] >= SHORTEST)
+            or not worth(states.shape[1] >= SHORTEST, states)
             or ordinary((states,)) != self._where
             or self.program.differentiated()
         ):

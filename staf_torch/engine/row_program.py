@@ -15,8 +15,8 @@ from torch import Tensor, nn
 from ..approximation.basis import GramStructure, StaFBasis, Target
 from ..lanes import Program
 from ..lanes.call import say_transformed, served
-from ..lanes.compiled_methods import worth
 from ..lanes.shared_programs import SharedPrograms
+from ..lanes.when_compiled import worth
 from ..optim.base import UpdateLaw
 from ..optim.objective import NativeError, Objective, Precomputed
 from .certificate import Certificate, certify, first_link
@@ -151,7 +151,7 @@ def program(problem: Problem, states: Tensor, carry: RowCarry, *, everything: bo
         carry: what it starts from.
         everything: whether all results are wanted, or the weights alone.
     """
-    if not worth(states.shape[1] >= SHORTEST):
+    if not worth(states.shape[1] >= SHORTEST, states):
         return None
     if not served((states, carry.chase.weights)):
         say_transformed("the chase")

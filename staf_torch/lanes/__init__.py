@@ -3,7 +3,6 @@
 from . import device as device
 from .adjoint import gradient_memory as gradient_memory
 from .compiled_methods import compiled as compiled
-from .compiled_methods import compiling as compiling
 from .compiled_methods import ready as ready
 from .loops import each as each
 from .loops import reduce as reduce
@@ -15,6 +14,7 @@ from .program import Program as Program
 from .row_objects import rows as rows
 from .shared_programs import shared_program as shared_program
 from .tree import Shared as Shared
+from .when_compiled import compiling as compiling
 
 __all__ = [
     "Program",

@@ -1,4 +1,4 @@
-"""Methods of a class that a program serves once their calls pay for it: `compiled`, `ready`, `compiling`.
+"""Methods of a class that a program serves once their calls pay for it: `compiled`, `ready`.
 
 A policy is asked ten times in a test and a hundred thousand times in a control loop. Its class says in one
 line that a method may be compiled, ``@compiled("a policy")``; the method stays plain torch, which is what it
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from types import CodeType, MethodType
 from typing import Any, Protocol, overload
 
@@ -37,53 +37,11 @@ from .row_numbers import RowNumbers, over_rows, points_of_rows
 from .shared_programs import shared_program
 from .trace.step import Step
 from .tree import Shared, Tree, flatten, plain, unflatten
+from .when_compiled import undecided, worth
 
 _PAYS = 100  # calls of a small batch in plain torch after which it is compiled, however short they are
 _SOON = 30  # calls
 _KEPT = 64  # shapes of calls that are remembered
-WHEN = ("auto", "always", "never")
-_when = "auto"
-
-
-@contextlib.contextmanager
-def compiling(when: str) -> Iterator[None]:
-    """Override, within the block, the automatic choice between compiled code and plain torch.
-
-    Chases, trajectories, closed loops (``compile="auto"``) and policies compile by themselves where a call is
-    long enough to pay for the compiler. A timed control loop wants ``"always"``, a debugger ``"never"``. An
-    explicit ``compile=True`` or ``False``, and a `Program` that is called directly, are not affected.
-
-    Example:
-        >>> x0 = torch.tensor([[1.0, 0.0]]).double()
-        >>> with lanes.compiling("never"):
-        ...     states = systems.simulate(systems.VanDerPol(), x0, dt=0.01, steps=1000)
-
-        Shown by `staf_torch/lanes/README.md`.
-
-    Args:
-        when: ``auto``, ``always`` (where it is possible at all) or ``never``; of the whole process.
-
-    Raises:
-        ValueError: for another word.
-    """
-    global _when
-    if when not in WHEN:
-        raise ValueError(f"`compiling(when=...)` must be one of {', '.join(WHEN)}; got {when!r}.")
-    before, _when = _when, when
-    try:
-        yield
-    finally:
-        _when = before
-
-
-def undecided(compile: bool | str = "auto") -> bool:
-    """Return whether a caller, and `compiling`, leave the choice to the library."""
-    return compile == "auto" and _when == "auto"
-
-
-def worth(pays: bool) -> bool:
-    """Return whether an automatic choice falls on compiled code, where a call would pay or not."""
-    return pays if _when == "auto" else _when == "always"
 
 
 class Served(Protocol):
@@ -186,7 +144,7 @@ class CompiledMethod:
     def __call__(self, x: Tensor, /, *more: Tree) -> Any:
         """y: (..., n) -> (..., m), or trees of (B, ...)."""
         read = self._read
-        if read is not None and not more and at_once(x) and _when != "never" and not tracing_now():
+        if read is not None and not more and at_once(x) and worth(True) and not tracing_now():
             try:
                 found = self._at_once.get((x.shape, x.stride(), x.dtype))
             except RuntimeError:  # neither of one that is sparse or nested
@@ -206,7 +164,7 @@ class CompiledMethod:
             return self._defined(x, *more)
         if plain:
             return self._exported(x, *more) if is_exporting() else self._learned(x, *more)
-        if self._served is None or _when == "never":
+        if self._served is None or not worth(True):
             if not _is_state(x):
                 return self._refused(x, *more)
             rows = x.numel() / x.shape[-1]
@@ -240,7 +198,7 @@ class CompiledMethod:
         """Compute what may have a gradient: by the program that serves, if one does, or the definition."""
         program: Program | None = getattr(self._served, "program", None)
         given = flatten((x, *more))[0]
-        usable = _when != "never" and torch.is_grad_enabled() and isinstance(x, Tensor) and not tracing_now()
+        usable = worth(True) and torch.is_grad_enabled() and isinstance(x, Tensor) and not tracing_now()
         if program is None or not usable or x.is_nested or not x.numel() or not served_by(given):
             return self._defined(x, *more)
         if self._read is None or not self._read.unchanged(library=False):

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..lanes import Program, repeat
-from ..lanes.compiled_methods import undecided, worth
+from ..lanes.device.host import capturing
 from ..lanes.gradients import wants_gradient
 from ..lanes.loop_program import LoopProgram
 from ..lanes.opaque import opaque
@@ -20,6 +20,7 @@ from ..lanes.row_numbers import over_rows, over_some_rows, some_rows
 from ..lanes.shared_programs import SharedPrograms
 from ..lanes.trace.step import Step
 from ..lanes.tree import Tree
+from ..lanes.when_compiled import undecided, worth
 from ..numerics.checks import integer, positive_real, trailing
 from ..numerics.default_device import beside
 from ..numerics.exponential_step import BENT, GRACE, MOST, TOLERANCE, TRIED, needed_steps
@@ -70,7 +71,7 @@ def trajectory(
     flow = getattr(system, "flow", None)  # a user's module need not have one
 
     often = DIFFERENTIATED if wants_gradient(system, x0) else 1
-    program, x = _stepped(system, dt, 1, often * total, len(x0)), x0
+    program, x = _stepped(system, dt, 1, often * total, x0), x0
     none = x0.detach().new_full((1,), torch.nan).expand(len(x0))
     for start in range(0, total, size):
         stop = min(start + size, total)
@@ -81,7 +82,7 @@ def trajectory(
                 yield exact
                 continue
         (after, bent, reach), piece = program((x, none, none), steps=stop - start)
-        if x.is_cuda and torch.cuda.is_current_stream_capturing():  # nothing can be read, nor done again
+        if capturing(x):  # nothing can be read, nor done again
             strained = ~(bent <= BENT * reach) & torch.isfinite(reach)
             x = torch.where(strained.unsqueeze(-1), torch.nan, after)
             yield torch.where(strained[:, None, None], torch.nan, piece)
@@ -111,9 +112,13 @@ Tracked = tuple[Tensor, Tensor, Tensor]
 
 
 def _stepped(
-    system: ControlAffineSystem, dt: float, count: int, times: int, rows: int
+    system: ControlAffineSystem, dt: float, count: int, times: int, x: Tensor
 ) -> Program | LoopProgram:
-    """Steps of dt in so many Runge-Kutta steps, which record the state before every one."""
+    """Steps of dt in so many Runge-Kutta steps, which record the state before every one.
+
+    In plain torch they leave NaN where the rate's bend is asked for, which the states tell afterwards; not
+    while a graph is recorded.
+    """
 
     def tracked(system: ControlAffineSystem, dt: float, count: int) -> Step:
         def step(now: Tracked, given: Tree, row: Tree) -> tuple[Tracked, Tensor]:
@@ -132,8 +137,10 @@ def _stepped(
         known = _kept.unchanged(*parts)
         return _kept.of(tracked(*parts), *parts, owners=parts, make=tracked) if known is None else known
 
-    if worth(count * times * (1 + rows / 200) >= _PAYS):
+    if worth(count * times * (1 + len(x) / 200) >= _PAYS, x):
         return compiled()
+    if capturing(x):
+        return Program(tracked(system, dt, count), name="a trajectory", compile=False)
     plain = Program(untracked, name="a trajectory", compile=False)
     return LoopProgram(plain, compiled, times) if undecided() else plain
 
@@ -188,7 +195,7 @@ def _refined(
             begun = x[chosen], torch.zeros_like(x[chosen, 0]), torch.zeros_like(x[chosen, 0])
             times = piece.shape[1]
             with some_rows(chosen):
-                (end, _, _), again = _stepped(system, dt, factor, times, len(chosen))(begun, steps=times)
+                (end, _, _), again = _stepped(system, dt, factor, times, begun[0])(begun, steps=times)
             after, piece = after.index_copy(0, chosen, end), piece.index_copy(0, chosen, again)
     wrong = found.error > GRACE * TOLERANCE
     if bool(wrong.any()):

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from ...lanes import Program
-from ...lanes.compiled_methods import undecided, worth
 from ...lanes.gradients import wants_gradient
 from ...lanes.loop_program import LoopProgram
 from ...lanes.opaque import opaque
@@ -19,6 +18,7 @@ from ...lanes.philox import seed_parts
 from ...lanes.plain_time import DIFFERENTIATED
 from ...lanes.row_numbers import over_rows, some_rows
 from ...lanes.tree import flatten, unflatten
+from ...lanes.when_compiled import undecided, worth
 from ...numerics.angles import wrap
 from ...numerics.checks import choice, copied, fail, integer
 from ...numerics.default_device import beside
@@ -204,9 +204,10 @@ class _LoopRun:
         parts = list(loop.controller.modules())
         work = self.steps * (loop.holding.steps + max(getattr(part, "work", 1.0) for part in parts) - 1)
         often = DIFFERENTIATED if torch.is_grad_enabled() else 1  # as `simulate` found out
-        pays = often * work * (1 + len(self.x0) / 200) >= _PAYS
-        pays = pays and not any(getattr(part, "costly", False) for part in parts)
-        compiled = (worth(pays) if self.compile == "auto" else bool(self.compile)) and loop.system.traceable
+        costly = any(getattr(part, "costly", False) for part in parts)
+        pays = not costly and often * work * (1 + len(self.x0) / 200) >= _PAYS
+        chosen = worth(pays, None if costly else self.x0) if self.compile == "auto" else bool(self.compile)
+        compiled = chosen and loop.system.traceable
         found = program(loop, compiled) if make is None else make(compiled)
         ran = _beginning(loop, found, self.steps) if not compiled and undecided(self.compile) else found
         counted = self.progress is None and ran is found  # a `LoopProgram` counts its steps itself

@@ -91,13 +91,13 @@ class CudaDevice:
             read[name] = value.value
         return read
 
-    def launch(self, kernel: ctypes.c_void_p, arguments: int, rows: int) -> None:
+    def launch(self, kernel: ctypes.c_void_p, arguments: ctypes.Array[ctypes.c_char], rows: int) -> None:
         """Put a kernel for so many rows on the stream that torch has on this device now."""
         if torch._C._cuda_getDevice() != self.index:
             with torch.cuda.device(self.index):
                 return self.launch(kernel, arguments, rows)
         block = _WARP if rows <= self._few else _BLOCK
-        given = (ctypes.c_void_p * 1)(arguments)
+        given = (ctypes.c_void_p * 1)(ctypes.addressof(arguments))
         grid = -(-rows // block), 1, 1, block, 1, 1
         failed = self._launch(kernel, *grid, 0, self._stream(self.index), given, None)
         if failed in _NO_CONTEXT:  # of a thread that has not asked torch for anything yet

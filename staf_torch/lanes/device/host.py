@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from .. import call
 from ..compiler import library
@@ -86,7 +87,43 @@ def recorded() -> Iterator[list[str]]:
         _taken = before
 
 
+@contextlib.contextmanager
+def captured() -> Iterator[list[Callable[[], None]]]:
+    """Context: as `host` while a graph is recorded, where no number can be read; yields the launches.
+
+    Each is called to run its kernel again, with the arguments of the recording.
+
+    Example:
+        >>> program, x = lanes.Program(lambda x, now, row: (0.5 * x, x)), torch.ones(1)
+        >>> with lanes.device.captured() as launches:
+        ...     end, _ = program(x, steps=3)
+        >>> x.fill_(8.0)
+        tensor([8.])
+        >>> launches[0]()
+        >>> end
+        tensor([1.])
+
+        Shown by `tests/lanes/test_device.py`.
+    """
+    global _launches
+    before, launches = _launches, list[Callable[[], None]]()
+    try:
+        with host():
+            _launches = launches
+            yield launches
+    finally:
+        _launches = before
+
+
+def capturing(x: Tensor) -> bool:
+    """Return whether what is done with a tensor is recorded for a graph, where no number can be read."""
+    if x.is_cuda:
+        return torch.cuda.is_current_stream_capturing()
+    return x.is_cpu and _launches is not None
+
+
 _taken: list[str] | None = None
+_launches: list[Callable[[], None]] | None = None
 
 
 class HostDevice:
@@ -109,12 +146,16 @@ class HostDevice:
                 _kernels[text] = found
             return found
 
-    def launch(self, kernel: Any, arguments: int, rows: int) -> None:
+    def launch(self, kernel: Any, arguments: ctypes.Array[ctypes.c_char], rows: int) -> None:
         """Run a kernel for so many rows.
 
         Args:
             kernel: of `compile`.
-            arguments: the address of its structure.
+            arguments: its structure.
             rows: at least 1.
         """
-        kernel(arguments, -(-rows // _BLOCK), _BLOCK)
+        sizes = -(-rows // _BLOCK), _BLOCK
+        if _launches is not None:
+            copy = ctypes.create_string_buffer(arguments.raw, len(arguments))
+            _launches.append(lambda: kernel(ctypes.addressof(copy), *sizes))
+        kernel(ctypes.addressof(arguments), *sizes)

@@ -18,7 +18,7 @@ from ..locks import Mutex
 from ..row_numbers import columns
 from ..tree import Shared, plain
 from .cuda import CudaDevice
-from .host import HostDevice
+from .host import HostDevice, capturing
 
 _MOST = 2**31 - 1  # of an offset of 32 bits
 
@@ -29,8 +29,8 @@ class Device(Protocol):
     def compile(self, text: str) -> Any:
         """Return the kernel of a text; raises OSError where it cannot."""
 
-    def launch(self, kernel: Any, arguments: int, rows: int) -> None:
-        """Start a kernel for so many rows, with the structure at an address."""
+    def launch(self, kernel: Any, arguments: ctypes.Array[ctypes.c_char], rows: int) -> None:
+        """Start a kernel for so many rows, with this structure."""
 
 
 @functools.cache
@@ -113,18 +113,19 @@ class DeviceCall:
 
     def _arguments(self, read: Sequence[tuple[int, ...]], rows: int, steps: int, every: int) -> None:
         table = self._compiled.table
+        self._table: Tensor | None = None
         pointers, numbers = len(read) + len(self._rooms), table.tolist()
         kind = "f" if self._compiled.real == torch.float32 else "d"
         held = f"{len(numbers)}{kind}"
         if not in_arguments(len(numbers), kind == "f"):
-            self._table = table.to(self._where)  # kept
+            self._table = table.to(self._where)
             numbers, held = [self._table.data_ptr()], "P"
         strides = [stride for slot in read for stride in slot[:3]]
         whole = struct.Struct(f"{pointers}P{held}{len(strides)}qq2i0q")
         self._record = ctypes.create_string_buffer(whole.size)
         whole.pack_into(self._record, 0, *[0] * pointers, *numbers, *strides, rows, steps, every)
         self._pack = struct.Struct(f"{pointers}P").pack_into
-        self._reference, self._lock = ctypes.addressof(self._record), Mutex()
+        self._lock = Mutex()
 
     def _input(self, k: int, leaf: Any, timed: bool) -> tuple[int, int, int, int]:
         """Strides from row to row, from time to time and from entry to entry, and how many entries."""
@@ -163,7 +164,9 @@ class DeviceCall:
         addresses = [0 if room is None else room.data_ptr() for room in rooms]
         with self._lock:  # the driver copies the structure when it is called
             self._pack(self._record, 0, *map(_address, given), *addresses)
-            self._device.launch(self._kernel, self._reference, self._rows)
+            self._device.launch(self._kernel, self._record, self._rows)
+        if self._table is not None and capturing(self._table):
+            _of_graphs[self._table.data_ptr()] = self._table
         return rooms
 
     def _too_large(self) -> str:
@@ -189,3 +192,5 @@ class DeviceCall:
 
 
 _address = Tensor.data_ptr
+_of_graphs: dict[int, Tensor] = {}
+"""Tables that recorded graphs read at their addresses, whatever becomes of the call that made them."""
