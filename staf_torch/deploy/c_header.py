@@ -16,10 +16,10 @@ from torch import Tensor, nn
 
 from ..adp import Controller
 from ..lanes import Program
-from ..lanes.call import Given
 from ..lanes.compiler import run
 from ..lanes.emit.c import commented
 from ..lanes.emit.identifiers import checked_names, guarded
+from ..lanes.given import Given
 from ..lanes.row_objects import refuse_rows, row_of
 from ..lanes.trace.graph import WIDE
 from ..lanes.trace.step import trace

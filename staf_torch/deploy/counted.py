@@ -9,8 +9,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..lanes.call import Given
 from ..lanes.emit.schedule import Schedule
+from ..lanes.given import Given
 from ..lanes.row_independence import doubt
 from ..lanes.trace.step import Step, Traced, trace
 from ..lanes.trace.tracer import NotLoweredError

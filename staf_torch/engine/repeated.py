@@ -12,8 +12,8 @@ from torch import Tensor
 
 from ..lanes import Program
 from ..lanes.call import form, ordinary
-from ..lanes.contents import is_users
 from ..lanes.device.kernel import DeviceCall
+from ..lanes.lookups import is_users
 from ..lanes.tree import flatten, unflatten
 from ..lanes.when_compiled import worth
 from .problem import Problem

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..adp import LQR, BoxFilter, Cost, DirectShooting, Feedback, LoopResult, QuadraticCost, SafetyFilter
 from ..adp.loop.setup import OptimumSettings
-from ..adp.safety.safety_filter import walls
+from ..adp.safety.box_filter import walls
 from ..figures.closed_loop import BoxHistory, draw_box
 from ..figures.style import draws
 from ..metrics.safety import constraint_metrics

@@ -16,14 +16,16 @@ from torch import Tensor
 
 from .adjoint_steps import Substituted
 from .backward import Backward, empty_rows, rows_at_once, some_rows, split
-from .call import Compiled, Given, PlannedCall, fresh
+from .call import Compiled, PlannedCall, fresh
 from .device.kernel import DeviceCall
+from .given import Given
 from .log import say
 from .row_numbers import RowNumbers, columns
 from .tree import Shared, flatten, plain, unflatten
 
 if TYPE_CHECKING:
-    from .program import Built, Program
+    from .program import Program
+    from .texts import Built
     from .trace.captured_tensors import TableSlopes
 
 _WORTH = 10  # operations of a step for each byte of its carry: kept, it costs less than the step again

@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from .adjoint_steps import Deciding, Differentiated, ReversedStep, Substituted, adjoint_step, deciding
-from .call import Given, fresh, inner_strides
+from .call import fresh, inner_strides
+from .given import Given
 from .row_independence import undrawn
 from .trace.captured_tensors import TableSlopes
 from .trace.step import Step

@@ -32,8 +32,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from .contents import is_users
 from .emit.tables import Text
+from .lookups import is_users
 from .row_numbers import RowNumbers
 from .trace.captured_tensors import Recipe
 from .trace.captured_tensors import tensors as tensors_of

@@ -22,7 +22,7 @@ from ..signs import Sign
 from .compiler import compiled
 from .log import say
 from .row_numbers import RowNumbers, columns
-from .tree import Shared, Tree, flatten, labels, plain, unflatten
+from .tree import Shared, plain
 
 LARGE = 2**22  # bytes from which pages of two megabytes are worth asking for
 _HUGE = 2**21
@@ -382,107 +382,3 @@ def _parallel() -> int | None:
 
 
 _BINDING = ("OMP_PROC_BIND", "OMP_PLACES", "GOMP_CPU_AFFINITY")
-
-
-def whole(name: str, value: object, least: int) -> int:
-    """Return an argument of a program's call that must be an integer."""
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise ValueError(f"`Program({name}=...)` must be an integer, at least {least}; got {value!r}.")
-    return value
-
-
-def _sizes(leaves: dict[str, list[Any]], structures: dict[str, Any]) -> tuple[int | None, int | None]:
-    """Return the numbers of rows and times of inputs, checked: all that compiled code reads by address.
-
-    Raises:
-        ValueError: that names the input which has no numbers in order here, or another size than the others.
-    """
-    sizes: dict[str, tuple[int, str]] = {}
-    device: tuple[torch.device, str] | None = None
-    for tree in ("carry", "now", "row"):
-        for label, leaf in zip(labels(structures[tree], tree), leaves[tree], strict=True):
-            shared, tensor = type(leaf) is Shared, plain(leaf)
-            name = f"`Program({tree}=...)`" + (f", its {label}," if label != tree else "")
-            if shared and tree == "carry":
-                raise ValueError(f"{name} must have rows; got a `Shared` tensor.")
-            if not isinstance(tensor, Tensor):
-                raise ValueError(f"{name} must be a tensor; got {type(tensor).__name__}.")
-            if tensor.is_nested or tensor.is_quantized or tensor.layout is not torch.strided:
-                kind = "nested" if tensor.is_nested else f"{tensor.layout}, {tensor.dtype}"
-                raise ValueError(f"{name} must be dense; got a tensor that is {kind}.")
-            if device is None:
-                device = tensor.device, name
-            elif tensor.device != device[0] and tensor.dim() > 0:
-                raise ValueError(
-                    f"{name} must be on {device[0]} like {device[1].rstrip(',')}; got one on {tensor.device}."
-                )
-            kinds = [] if shared else ["rows"]
-            kinds += ["times"] if tree == "now" else []
-            if tensor.dim() < len(kinds):
-                raise ValueError(
-                    f"{name} must begin with {' and '.join(kinds)}; got the shape {tuple(tensor.shape)}."
-                )
-            for kind, size in zip(kinds, tensor.shape, strict=False):
-                known, first = sizes.setdefault(kind, (size, name))
-                if known != size:
-                    raise ValueError(f"{name} must have {known} {kind} like {first.rstrip(',')}; got {size}.")
-    return sizes.get("rows", (None, ""))[0], sizes.get("times", (None, ""))[0]
-
-
-class Given(NamedTuple):
-    """The inputs of a call as lists."""
-
-    carry: list[Tensor]
-    now: list[Any]
-    row: list[Any]
-    structures: dict[str, Any]
-    rows: int
-    times: int
-
-    @classmethod
-    def of(cls, carry: Tree, now: Tree, row: Tree, steps: int | None) -> Given:
-        leaves, structures = {}, {}
-        for name, tree in (("carry", carry), ("now", now), ("row", row)):
-            leaves[name], structures[name] = flatten(tree)
-            try:
-                hash(structures[name])
-            except TypeError as error:
-                rule = "must be a tree of tensors and numbers: write `torch.as_tensor` around an array"
-                raise ValueError(f"`Program({name}=...)` {rule}; {error}.") from error
-        rows, times = _sizes(leaves, structures)
-        if rows is None:
-            raise ValueError(
-                "`Program(...)` must be given at least one tensor with a dimension of rows; got none."
-            )
-        if times is None:
-            if steps is None:
-                raise ValueError("`Program(steps=...)` must be given where no input has times; got None.")
-            times = whole("steps", steps, 0)
-        return cls(**leaves, structures=structures, rows=rows, times=times)
-
-    @property
-    def real(self) -> torch.dtype:
-        floats = [plain(leaf).dtype for leaf in (*self.carry, *self.now, *self.row)]
-        return torch.float64 if torch.float64 in floats or torch.float32 not in floats else torch.float32
-
-    def trees(self) -> Tree:
-        """The trees (row, now, carry)."""
-        return tuple(self.tree(name, getattr(self, name)) for name in ("row", "now", "carry"))
-
-    def tree(self, name: str, leaves: Sequence[Any]) -> Tree:
-        return unflatten(self.structures[name], iter(leaves))
-
-    def key(self) -> Hashable:
-        parts: list[Hashable] = [(leaf.shape[1:], leaf.dtype) for leaf in self.carry]
-        for skip, leaves in ((2, self.now), (1, self.row)):
-            for leaf in leaves:
-                shared = isinstance(leaf, Shared)
-                tensor = plain(leaf)
-                parts.append((tensor.shape[skip - shared :], tensor.dtype, shared))
-        return tuple(parts), tuple(self.structures.values())
-
-    def ordinary(self) -> Where:
-        """Return where all tensors are, as `ordinary`; False where there are no rows or times."""
-        if self.rows == 0 or self.times == 0:
-            return False
-        return ordinary((*self.carry, *self.now, *self.row))

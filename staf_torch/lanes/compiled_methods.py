@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from types import CodeType, MethodType
 from typing import Any, Protocol, overload
 
@@ -22,8 +22,7 @@ from torch.compiler import is_exporting
 from torch.utils import _device
 
 from ..signs import Sign
-from . import call
-from .call import PlannedCall, at_once, ordinary
+from .call import at_once, ordinary
 from .call import served as served_by
 from .contents import BOUND, Contents
 from .locks import Mutex
@@ -31,11 +30,9 @@ from .loops import tracing_now
 from .one_thread import ENTRIES, alone
 from .opaque import opaque
 from .plain_time import PlainTime
-from .prepared import Plan
 from .program import Program
+from .row_functions import Rows, Trees, is_state
 from .row_numbers import RowNumbers, over_rows, points_of_rows
-from .shared_programs import shared_program
-from .trace.step import Step
 from .tree import Shared, Tree, flatten, plain, unflatten
 from .when_compiled import undecided, worth
 
@@ -165,7 +162,7 @@ class CompiledMethod:
         if plain:
             return self._exported(x, *more) if is_exporting() else self._learned(x, *more)
         if self._served is None or not worth(True):
-            if not _is_state(x):
+            if not is_state(x):
                 return self._refused(x, *more)
             rows = x.numel() / x.shape[-1]
             if not self._pays(rows):
@@ -207,7 +204,7 @@ class CompiledMethod:
         if more:
             leaves, structure = flatten(program((), (), (x, *more), steps=1)[1])
             return unflatten(structure, iter([leaf[:, 0] for leaf in leaves]))
-        if not _is_state(x):
+        if not is_state(x):
             return self._refused(x)
         with points_of_rows(len(x), x.shape[1:-1].numel()) if x.dim() > 2 else contextlib.nullcontext():
             y: Tensor = program((), (), (x.reshape(-1, x.shape[-1]),), steps=1)[1]
@@ -241,7 +238,7 @@ class CompiledMethod:
     def _refused(self, x: Tensor, *more: Tree) -> Any:
         """Raise what the definition says of x, or that no state is an integer, a flag or a single number."""
         found = self._defined(x, *more)
-        if _is_state(x):
+        if is_state(x):
             return found
         name = f"{type(self.owner).__name__}.{self.definition.__name__}"
         rule = "must be states (..., n) of floating point: write `.double()`"
@@ -298,7 +295,7 @@ class CompiledMethod:
             if settings.by is None:
                 made = self.definition, settings.name, self.definition, self.owner
                 rows = Rows(*made, copies=settings.copies, make=lambda definition, _: definition)
-                served = _Trees(rows) if trees else rows
+                served = Trees(rows) if trees else rows
             elif not read.wants_gradient():
                 served = settings.by(self.owner)
             self._at_once = {} if served is None else served.at_once
@@ -346,94 +343,3 @@ def methods_of(owner: Any) -> list[CompiledMethod]:
     return [
         value.__get__(owner, type(owner)) for kind in kinds for value in kind if isinstance(value, compiled)
     ]
-
-
-def _is_state(x: Tensor) -> bool:
-    return x.is_floating_point() and x.dim() > 0
-
-
-def check_states(given: Sequence[Tensor]) -> None:
-    """Refuse states that are integers, flags or single numbers, when their form is new."""
-    for x in given:
-        if not _is_state(x):
-            raise ValueError(f"states must be (..., n) of floating point; got {tuple(x.shape)} of {x.dtype}.")
-
-
-class Rows:
-    """y = function(a, b, ...), (B, ...) to (B, ...), where nobody traces or differentiates.
-
-    Args:
-        function: plain torch, in which no row sees another.
-        name: in the log.
-        parts: all that ``function`` reads, for `shared_program`; none where nothing is to be shared.
-        copies: as in `Program`.
-        make: ``function`` from the parts, as in `shared_program`.
-    """
-
-    def __init__(
-        self,
-        function: Callable[..., Tree],
-        name: str,
-        *parts: Any,
-        copies: int = 1,
-        make: Callable[..., Callable[..., Tree]] | None = None,
-    ) -> None:
-        def step_of(function: Callable[..., Tree]) -> Step:
-            return lambda carry, _, row: (carry, function(*row))
-
-        if parts:
-            told = None if make is None else (lambda *others: step_of(make(*others)))
-            self.program = shared_program(name, step_of(function), *parts, copies=copies, make=told)
-        else:
-            self.program = Program(step_of(function), name=name, copies=copies)
-        self._plans: dict[Any, Plan] = {}
-        self.at_once: dict[Any, Callable[[Tensor], Tensor]] = {}
-
-    @property
-    def compiled(self) -> bool:
-        """Return whether a compiled program has served a call."""
-        return bool(self._plans)
-
-    def __call__(self, *given: Tensor) -> Tensor:
-        """Return y with a dimension of one time after the rows, (B, 1, ...); (n,) is one row."""
-        # Shapes alone: the caller has looked at the rest.
-        key = tuple([(x.shape, x.stride(), x.dtype, call.processor if x.is_cpu else x.device) for x in given])
-        plan = self._plans.get(key)
-        if plan is not None:
-            return plan(given)[0]
-        check_states(given)
-        rows = [x.unsqueeze(0) if x.dim() == 1 else x for x in given]
-        plan, found = self.planned(*rows)
-        if plan is not None:
-            if len(self._plans) >= _KEPT:
-                self._plans.clear()
-                self.at_once.clear()
-            self._plans[key] = plan
-            keep_at_once(self.at_once, plan, *given)
-        return found
-
-    def planned(self, *given: Tensor) -> tuple[Plan | None, Tensor]:
-        """Return the plan of calls with such inputs, (B, ...), None where the definition runs; and y."""
-        prepared = self.program.prepare((), (), tuple(given), steps=1)
-        found: Tensor = prepared((), (), tuple(given))[1]
-        return prepared.plan, found
-
-
-def keep_at_once(known: dict[Any, Callable[[Tensor], Tensor]], plan: Plan, x: Tensor, *more: Tensor) -> None:
-    """Note what finds y for states like x alone, (n,) or (B, n), where that is a call of machine code."""
-    found = plan.of_states(*x.shape[:-1]) if isinstance(plan, PlannedCall) and not more else None
-    if found is not None:
-        known[x.shape, x.stride(), x.dtype] = found
-
-
-class _Trees:
-    """The variant of `Rows` that maps trees (B, ...) to trees (B, ...)."""
-
-    def __init__(self, rows: Rows) -> None:
-        self.program, self.compiled = rows.program, False
-        self.at_once: dict[Any, Callable[[Tensor], Tensor]] = {}
-
-    def __call__(self, *given: Tree) -> Tree:
-        self.compiled = self.compiled or self.program.compiles((), (), given, steps=1)
-        leaves, structure = flatten(self.program((), (), given, steps=1)[1])
-        return unflatten(structure, iter([leaf[:, 0] for leaf in leaves]))

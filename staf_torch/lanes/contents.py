@@ -20,11 +20,9 @@ import math
 import operator
 import pickle
 import sys
-import sysconfig
 from collections.abc import Callable, Iterator
 from itertools import chain
 from operator import is_
-from pathlib import Path
 from types import BuiltinFunctionType, CellType, CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
 
@@ -32,14 +30,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from .lookups import EMPTY, Lookup, attribute_parts, content_of, lookups
+from .lookups import EMPTY, OF_PYTHON, Lookup, attribute_parts, content_of, installed, is_users, lookups
 from .row_numbers import RowNumbers, all_rows
 
 _PACKAGE = __name__.partition(".")[0]
-_OF_PYTHON = frozenset(sys.stdlib_module_names) - {"__main__"}
-_FOLDERS = tuple(Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib", "purelib", "platlib"))
-_PACKAGES = frozenset(("site-packages", "dist-packages"))
-_VERSIONED = frozenset((_PACKAGE, "torch", "numpy", *_OF_PYTHON))  # other processes have the same
+_VERSIONED = frozenset((_PACKAGE, "torch", "numpy", *OF_PYTHON))  # other processes have the same
 ATOMS = frozenset((str, int, float, bool, bytes, tuple, type(None)))  # and what an address alone tells apart
 _SMALL = 1 << 14  # bytes of an array that are compared at every call
 _FIXED = (
@@ -58,28 +53,6 @@ _BASE, _ARRAY = operator.itemgetter(*_READ), operator.methodcaller("tobytes")
 BOUND = "_compiled_methods"
 """Attribute in which an object holds its compiled methods: no part of what it is."""
 _UNREAD, _HOOKS = IDLE | {BOUND}, ("_forward_hooks", "_forward_pre_hooks")
-
-
-@functools.lru_cache(maxsize=4096)
-def installed(module: str) -> bool:
-    """Return whether a module's code stands: this library's, Python's own, what lies in a folder of packages.
-
-    What is left is a user's: a script, a notebook, files beside it.
-    """
-    root = module.partition(".")[0]
-    if root == _PACKAGE or root in _OF_PYTHON or root.startswith("namedtuple_"):
-        return True
-    file = getattr(sys.modules.get(module), "__file__", None)
-    if file is None:
-        return False
-    path = Path(file)
-    return bool(_PACKAGES & set(path.parts)) or any(path.is_relative_to(folder) for folder in _FOLDERS)
-
-
-def is_users(value: FunctionType | type) -> bool:
-    """Return whether a function or a class is of a user, and may read what changes between two calls."""
-    module = value.__globals__.get("__name__") if isinstance(value, FunctionType) else value.__module__
-    return not (isinstance(module, str) and installed(module))
 
 
 class Derived:

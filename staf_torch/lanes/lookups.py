@@ -1,16 +1,22 @@
-"""Names that code looks up: globals of its module, attributes of modules and of classes found there."""
+"""Names that code looks up, and whose it is: globals of its module, attributes of modules and of classes."""
 
 from __future__ import annotations
 
 import dis
 import functools
 import sys
+import sysconfig
 from collections.abc import Iterable, Iterator
+from pathlib import Path
 from types import CellType, CodeType, FunctionType, ModuleType
 from typing import Any, NamedTuple
 
 from torch import Tensor
 
+_PACKAGE = __name__.partition(".")[0]
+OF_PYTHON = frozenset(sys.stdlib_module_names) - {"__main__"}
+_FOLDERS = tuple(Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib", "purelib", "platlib"))
+_PACKAGES = frozenset(("site-packages", "dist-packages"))
 _SIMPLE = (int, float, complex, str, bytes, tuple, list, dict, set, frozenset, Tensor)
 _MISSING = object()
 EMPTY = object()
@@ -83,3 +89,25 @@ def attribute_parts(name: str, value: Any) -> Iterable[Any]:
     value = getattr(value, "__func__", value)  # of a static or class method
     known = FunctionType if name.startswith("__") else (FunctionType, *_SIMPLE)  # no annotations
     return [value] if isinstance(value, known) else []
+
+
+@functools.lru_cache(maxsize=4096)
+def installed(module: str) -> bool:
+    """Return whether a module's code stands: this library's, Python's own, what lies in a folder of packages.
+
+    What is left is a user's: a script, a notebook, files beside it.
+    """
+    root = module.partition(".")[0]
+    if root == _PACKAGE or root in OF_PYTHON or root.startswith("namedtuple_"):
+        return True
+    file = getattr(sys.modules.get(module), "__file__", None)
+    if file is None:
+        return False
+    path = Path(file)
+    return bool(_PACKAGES & set(path.parts)) or any(path.is_relative_to(folder) for folder in _FOLDERS)
+
+
+def is_users(value: FunctionType | type) -> bool:
+    """Return whether a function or a class is of a user, and may read what changes between two calls."""
+    module = value.__globals__.get("__name__") if isinstance(value, FunctionType) else value.__module__
+    return not (isinstance(module, str) and installed(module))

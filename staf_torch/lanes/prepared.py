@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from .adjoint import GradientCall
-from .call import Given, PlannedCall, Where, form, ordinary, say_transformed, seen_by_others, whole
+from .call import PlannedCall, Where, form, ordinary, say_transformed, seen_by_others
 from .device.kernel import DeviceCall
+from .given import Given, whole
 from .log import say
 from .opaque import opaque
 from .tree import Tree, flatten, unflatten

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor
 
 from ..signs import Sign
-from . import cache
 from .adjoint_steps import Deciding, keeping_step
-from .cache import Trace
-from .call import Compiled, Given, form, ordinary, served
+from .call import Compiled, form, ordinary, served
 from .compiler import machine_code
 from .contents import Contents, Derived
 from .emit.c import Names, c_text
 from .emit.cpp import emit
+from .given import Given
 from .locks import Mutex
 from .log import say
 from .loops import scan, tracing_now
@@ -25,8 +24,8 @@ from .one_thread import ENTRIES, alone
 from .opaque import opaque
 from .prepared import Prepared
 from .row_independence import doubt, undrawn
-from .row_numbers import RowNumbers, over_rows, points_of_rows
-from .texts import Form, kernel, written
+from .row_numbers import over_rows, points_of_rows
+from .texts import Built, Form, kernel, known
 from .trace.step import Step, trace
 from .trace.step_copy import NoReverseError
 from .trace.tracer import NotLoweredError
@@ -397,7 +396,7 @@ class Program(Derived):
         for key, built in self._compiled.items():
             if built is not None:
                 found = built.trace.recipe.found
-                again = self._with_others(built, {id(t): self.in_place_of(t) for t in found})
+                again = built.with_others({id(t): self.in_place_of(t) for t in found}, self.in_place_of)
                 if again is None:
                     return False
                 self._compiled[key] = again
@@ -409,26 +408,14 @@ class Program(Derived):
             return None
         model, others = self._model
         built = model.built(given) if self._builds else model._compiled.get(key)
-        again = None if built is None else self._with_others(built, others)
+        again = None if built is None else built.with_others(others, self.in_place_of)
         return None if again is None else again._replace(followed=True)
-
-    def _with_others(self, built: Built, others: Mapping[int, Tensor]) -> Built | None:
-        """Return the built code with a table of the numbers of other tensors, None where its text differs."""
-        numbers = built.trace.recipe.again(others)
-        if numbers is None:
-            return None
-        table = built.trace.text.numbers(numbers, built.compiled.real)
-        given = [self.in_place_of(each) for each in built.trace.rows]
-        rows = tuple(each for each in given if isinstance(each, RowNumbers))
-        if len(rows) < len(given):
-            return None
-        return built._replace(compiled=built.compiled._replace(table=table, rows=rows))
 
     def _build(self, given: Given, form: Form) -> Built | None:
         self.reads()
         try:
             with undrawn(), Sign(f"compiling {self.name}"):
-                made = self._known(given, form)
+                made = known(self.step, self._described, given, form)
             if (lines := made.text.source.count("\n")) > _LONGEST:
                 raise NotLoweredError(f"the program is {lines} lines long, which take a compiler minutes")
             if not self._alone(given):  # before a compiler is asked for what would not be used
@@ -442,42 +429,13 @@ class Program(Derived):
             return None
         if self._read is not None:
             self._read.warn(self.name)
-        table = made.text.numbers(made.recipe.values, made.real)
-        shapes = tuple((leaf.shape[1:], leaf.dtype) for leaf in given.carry)
-        return Built(Compiled(call, table, made.real, shapes, made.outputs, made.structure, made.rows), made)
-
-    def _known(self, given: Given, form: Form) -> Trace:
-        """Return the trace of the step with a single row, from the cache where it has been traced before."""
-        shapes = None if self._described is None else Contents(given.key()).signature()
-        if self._described is None or shapes is None or not cache.unpatched():
-            return written(self.step, given, form)
-        step, tensors = self._described
-        path = cache.place(step, shapes, form)
-        found = cache.load(path, tensors)
-        if found is None:
-            found = written(self.step, given, form)
-            cache.save(path, found, tensors)
-        return found
+        return Built.of(made, call, given)
 
 
 def _loops_over(now: Tree) -> bool:
     """Return whether there are times, in tensors of which every row has its own."""
     leaves = flatten(now)[0]
     return bool(leaves) and not any(isinstance(leaf, Shared) for leaf in leaves)
-
-
-class Built(NamedTuple):
-    """The record of a program that was built.
-
-    Args:
-        compiled: the program.
-        trace: from which it was made.
-        followed: whether the trace is of the program that this one follows.
-    """
-
-    compiled: Compiled
-    trace: Trace
-    followed: bool = False
 
 
 _REQUIRES = operator.attrgetter("requires_grad")

@@ -20,7 +20,8 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
 from .contents import BOUND, Derived
-from .row_numbers import RowNumbers, all_rows, column_of, in_row, resolving, spread_rows, tried, turn_of
+from .each_row import in_row, spread_rows, tried, turn_of
+from .row_numbers import RowNumbers, all_rows, column_of, resolving
 
 _log = logging.getLogger(__name__)
 Some = TypeVar("Some")

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .call import Given
+from .given import Given
 from .loops import few_passes
 from .plain_time import RepaysError
 from .row_numbers import over_rows, some_rows

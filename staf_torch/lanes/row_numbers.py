@@ -12,7 +12,6 @@ function looks up; they announce themselves.
 from __future__ import annotations
 
 import copy
-import functools
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -89,7 +88,7 @@ class RowNumbers(Tensor):
     ) -> Any:
         kwargs = kwargs or {}
         resolve: Resolve | None = getattr(_active, "resolve", None)
-        if resolve is None or (resolve is _refuse and _asks_structure(func)):
+        if resolve is None or (resolve is refuse and _asks_structure(func)):
             return _operation(func, args, kwargs)
         if kwargs or any(isinstance(x, list | tuple) for x in args):
             args, kwargs = tree_map(lambda x: resolve(x) if isinstance(x, RowNumbers) else x, (args, kwargs))
@@ -119,7 +118,7 @@ class RowNumbers(Tensor):
 
 
 def _tried() -> bool:
-    return getattr(_active, "resolve", None) is _refuse
+    return getattr(_active, "resolve", None) is refuse
 
 
 def in_use() -> bool:
@@ -227,7 +226,7 @@ def over_rows(function: Callable[..., Some], *given: Tree) -> Some:
     if not RowNumbers.made or (getattr(_active, "resolve", None) is not None and not _tried()):
         return function(*given)  # there are none, or somebody outside has said whose
     try:
-        with resolving(_refuse):
+        with resolving(refuse):
             found = function(*given)
     except RowsMetError as met:
         return _mapped(function, given, met.numbers)
@@ -237,92 +236,6 @@ def over_rows(function: Callable[..., Some], *given: Tree) -> Some:
             "compute with them where the function is called."
         )
     return found
-
-
-def tried(function: Callable[[], Some]) -> tuple[Some | None, int | None]:
-    """Return function(), and how many rows the numbers have that it read: with None it read none of rows.
-
-    Args:
-        function: of no arguments; it is left where it reads a number of rows.
-    """
-    if not in_use():
-        return function(), None
-    try:
-        with resolving(_refuse):
-            return function(), None
-    except RowsMetError as error:
-        count = len(columns([error.numbers], None)[0])
-    for met in getattr(_active, "met", ()):
-        met.append(count)
-    return None, count
-
-
-def each_row(function: Callable[[], Some], most: int | None = None) -> list[Some]:
-    """function() of every row, which sees its own numbers alone; once where it reads no numbers of rows.
-
-    Args:
-        function: of no arguments.
-        most: rows, spread over all of them; all by default.
-    """
-    found, count = tried(function)
-    if count is None:
-        return [found]  # type: ignore[list-item]
-    return [in_row(row, count, function) for row in spread_rows(count, most).tolist()]
-
-
-def spread_rows(count: int, most: int | None = None) -> Tensor:
-    """Return rows (R,), so many at most, spread over all of them."""
-    few = count if most is None else min(count, most)
-    return torch.linspace(0, count - 1, few, dtype=torch.float64, device="cpu").round().long()
-
-
-def beside(function: Callable[[], Some]) -> Some | None:
-    """function() with numbers beside those of the first row; None where that is against a rule."""
-    for share in (1 - 1e-6, 1 + 1e-6):
-        try:
-            with resolving(functools.partial(_other, share)):
-                return function()
-        except (ValueError, TypeError, RuntimeError):
-            continue
-    return None
-
-
-def _other(share: float, numbers: RowNumbers) -> Tensor:
-    first = columns([numbers], None)[0][0]
-    return torch.where(first == 0, abs(1 - share), first * share)
-
-
-@contextmanager
-def met_rows() -> Iterator[list[int]]:
-    """Yield a list that is not empty once `each_row` has met numbers of rows in the block."""
-    met = list[int]()
-    before, _active.met = getattr(_active, "met", ()), [*getattr(_active, "met", ()), met]
-    try:
-        yield met
-    finally:
-        _active.met = before
-
-
-def in_row(row: int, count: int, function: Callable[[], Some]) -> Some:
-    """function() with the numbers of one row of so many."""
-    column = column_of(count)
-    with turn_of(row), resolving(lambda numbers: column(numbers)[row]):
-        return function()
-
-
-@contextmanager
-def turn_of(row: int) -> Iterator[None]:
-    """Within the block a function runs for this row, or for several of which it is the first."""
-    before, _active.row = getattr(_active, "row", 0), row
-    try:
-        yield
-    finally:
-        _active.row = before
-
-
-def first_row() -> bool:
-    """Return whether it is the turn of the first row, or of none: one warning in the log is enough."""
-    return getattr(_active, "row", 0) == 0
 
 
 def column_of(count: int) -> Callable[[RowNumbers], Tensor]:
@@ -350,7 +263,7 @@ def one_by_one() -> int:
     return apart
 
 
-def _refuse(numbers: RowNumbers) -> Tensor:
+def refuse(numbers: RowNumbers) -> Tensor:
     raise RowsMetError(numbers)
 
 

@@ -23,8 +23,9 @@ import torch
 from torch import Tensor, nn
 
 from .contents import BOUND, Contents, Derived
+from .each_row import beside, spread_rows, tried
 from .row_decisions import at_once, is_of_rows
-from .row_numbers import RowNumbers, all_rows, beside, in_use, over_rows, spread_rows, tried
+from .row_numbers import RowNumbers, all_rows, in_use, over_rows
 from .tree import Shared, plain
 
 Some = TypeVar("Some")

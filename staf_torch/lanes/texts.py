@@ -1,21 +1,85 @@
-"""Texts of a step: C++ for the processor, a kernel for a device."""
+"""Texts of a step, C++ for the processor or a kernel for a device, and what is built of them."""
 
 from __future__ import annotations
 
-import torch
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
+import torch
+from torch import Tensor
+
+from . import cache
 from .adjoint_steps import ReversedStep
 from .cache import Trace
-from .call import Given
+from .call import Compiled
+from .contents import Contents
 from .emit.cpp import emit
 from .emit.cuda import Dtypes, emit_cuda
 from .emit.tables import Text
+from .given import Given
+from .row_numbers import RowNumbers
 from .trace.step import Step, Traced, trace
 from .trace.tracer import NotLoweredError
 from .tree import plain
 
 Form = int | torch.device
 """Of compiled code: how many vectors of rows advance side by side, or the device whose kernel it is."""
+
+
+class Built(NamedTuple):
+    """The record of a program that was built.
+
+    Args:
+        compiled: the program.
+        trace: from which it was made.
+        followed: whether the trace is of the program that this one follows.
+    """
+
+    compiled: Compiled
+    trace: Trace
+    followed: bool = False
+
+    @classmethod
+    def of(cls, made: Trace, call: Any, given: Given) -> Built:
+        """Return the record of a trace and of the code of its text, for the numbers that it was made with."""
+        table = made.text.numbers(made.recipe.values, made.real)
+        shapes = tuple((leaf.shape[1:], leaf.dtype) for leaf in given.carry)
+        return cls(Compiled(call, table, made.real, shapes, made.outputs, made.structure, made.rows), made)
+
+    def with_others(
+        self, others: Mapping[int, Tensor], in_place_of: Callable[[Tensor], Tensor]
+    ) -> Built | None:
+        """Return the built code with a table of the numbers of other tensors, None where its text differs."""
+        numbers = self.trace.recipe.again(others)
+        if numbers is None:
+            return None
+        table = self.trace.text.numbers(numbers, self.compiled.real)
+        given = [in_place_of(each) for each in self.trace.rows]
+        rows = tuple(each for each in given if isinstance(each, RowNumbers))
+        if len(rows) < len(given):
+            return None
+        return self._replace(compiled=self.compiled._replace(table=table, rows=rows))
+
+
+def known(step: Step, described: tuple[bytes, Sequence[Tensor]] | None, given: Given, form: Form) -> Trace:
+    """Return the trace of a step with a single row, from the cache where it has been traced before.
+
+    Args:
+        step: of the program.
+        described: as `Program.described` was told; None where nobody has.
+        given: examples of the inputs.
+        form: of the code.
+    """
+    shapes = None if described is None else Contents(given.key()).signature()
+    if described is None or shapes is None or not cache.unpatched():
+        return written(step, given, form)
+    by, tensors = described
+    path = cache.place(by, shapes, form)
+    found = cache.load(path, tensors)
+    if found is None:
+        found = written(step, given, form)
+        cache.save(path, found, tensors)
+    return found
 
 
 def written(step: Step, given: Given, form: Form) -> Trace:

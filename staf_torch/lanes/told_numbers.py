@@ -15,7 +15,8 @@ from typing import Any
 
 from torch import Tensor
 
-from .contents import BOUND, Contents, Derived, is_users
+from .contents import BOUND, Contents, Derived
+from .lookups import is_users
 
 Told = dict[int, tuple[Any, dict[str, Tensor]]]
 """Objects by their addresses, and tensors by the names of the floats that they stand for."""

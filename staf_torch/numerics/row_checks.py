@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..lanes.row_numbers import each_row
+from ..lanes.each_row import each_row
 from . import show
 
 _known: weakref.WeakKeyDictionary[Any, set[Any]] = weakref.WeakKeyDictionary()  # targets that were tried

@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from ..lanes import scan
 from ..lanes.row_numbers import nonzero
 
 SHARES = (0.0, 0.5, 0.5, 1.0)
@@ -93,3 +95,41 @@ def stage_weights(length: float | Tensor, discount: float, like: Tensor) -> tupl
     worth = torch.stack((ends, middle * half, middle * half, ends * half.square()))
     # A number of the table is on the CPU in float64.
     return asked.to(like).unsqueeze(-1), counted.to(like).unsqueeze(-1), worth.to(like)
+
+
+RungeKuttaSums = tuple[Tensor, Tensor, Tensor]
+"""The slope of the last stage, the sum of what the slopes count, and what was paid."""
+
+
+def runge_kutta_loop(
+    displaced: Callable[[Tensor, Tensor], Tensor],
+    field: Callable[[Tensor], tuple[Tensor, Tensor]],
+    x: Tensor,
+    length: float | Tensor,
+    discount: float = 0.0,
+    watch: bool = False,
+) -> tuple[Tensor, ...]:
+    """`runge_kutta_step` with what is paid, as a loop over the stages, of which a program then contains one.
+
+    Args:
+        displaced: the state that a step leads to, as `systems.Plant.displaced`.
+        field: the velocity and the cost rate at a state.
+        x: (..., n).
+        length: s, a number or one a row.
+        discount: 1/s, of what is paid.
+        watch: whether to return how much the field bends within the step, h |k_3 - k_2|, the largest, too.
+
+    Returns:
+        x+ (..., n) and what was paid, (...).
+    """
+
+    def stage(now: RungeKuttaSums, share: tuple[Tensor, Tensor, Tensor]) -> tuple[RungeKuttaSums, Any]:
+        slope, moved, paid = now
+        ahead, count, value = share
+        slope, rate = field(displaced(x, ahead * slope))
+        return (slope, moved + count * slope, paid + value * rate), slope if watch else ()
+
+    start = torch.zeros_like(x), torch.zeros_like(x), torch.zeros_like(x[..., 0])
+    (_, moved, paid), slopes = scan(stage, start, stage_weights(length, discount, x), dim=0)
+    after = displaced(x, moved)
+    return (after, paid, length * (slopes[2] - slopes[1]).abs().amax(-1)) if watch else (after, paid)

@@ -17,7 +17,7 @@ from .. import adp
 from ..adp import LQR, Controller, Cost, Feedback, ValueBasis
 from ..adp.loop.setup import AdpProblem, OptimumSettings
 from ..adp.near_optimal_policy import NearOptimal
-from ..adp.safety.safety_filter import walls
+from ..adp.safety.box_filter import walls
 from ..approximation.basis import StaFBasis
 from ..numerics.checks import COMMAND_LINE, choice, fail, flag, integer, positive_real
 from ..systems import ControlAffineSystem, Plant

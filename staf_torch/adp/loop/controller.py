@@ -10,8 +10,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from ...lanes.contents import is_users, version
+from ...lanes.contents import version
 from ...lanes.gradients import gradients_of, marked
+from ...lanes.lookups import is_users
 from ...lanes.loops import where_rows
 from ...lanes.one_thread import small
 from ...lanes.row_numbers import over_rows

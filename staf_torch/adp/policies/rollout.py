@@ -15,19 +15,20 @@ from ...centers import Radius, StateFollowingCenters, ball, cross_polytope, ring
 from ...kernels import ExponentialKernel, GaussianKernel, Kernel
 from ...lanes import call, compiled, each, repeat
 from ...lanes.call import PlannedCall
-from ...lanes.compiled_methods import Rows, check_states
 from ...lanes.contents import Contents
+from ...lanes.each_row import each_row
 from ...lanes.one_thread import small
 from ...lanes.prepared import Plan
-from ...lanes.row_numbers import RowNumbers, each_row, points_of_rows
+from ...lanes.row_functions import Rows, check_states
+from ...lanes.row_numbers import RowNumbers, points_of_rows
 from ...lanes.row_objects import Rowwise
 from ...numerics.checks import fail, integer, positive_real, trailing
 from ...numerics.default_device import beside, device_of
 from ...numerics.exponential_step import stalls
+from ...numerics.runge_kutta import runge_kutta_loop
 from ...systems import Barrier, ControlAffineSystem
 from ..loop.controller import LQR, Policy, Value
 from ..problem.cost import Cost
-from ..problem.held_plant import runge_kutta_loop
 from ..problem.shapes import check_policy, check_problem, check_value
 
 _NAME = "a rollout policy"
@@ -235,7 +236,7 @@ class RolloutPolicy(nn.Module, metaclass=Rowwise):
             return self.model.velocity(x, u), self.cost.rate(x, u)
 
         def step(now: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-            after, paid = runge_kutta_loop(self.model, field, now[0], length)
+            after, paid = runge_kutta_loop(self.model.displaced, field, now[0], length)
             return after, now[1] + paid
 
         def whole(x: Tensor) -> Tensor:

@@ -6,15 +6,15 @@ import copy
 import logging
 import math
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from ...lanes import repeat, scan
+from ...lanes import repeat
+from ...lanes.each_row import each_row, met_rows
 from ...lanes.loops import untraced
 from ...lanes.row_decisions import is_of_rows
-from ...lanes.row_numbers import each_row, met_rows, nonzero
+from ...lanes.row_numbers import nonzero
 from ...lanes.row_objects import made_by_rows
 from ...numerics.checks import integer, positive_real
 from ...numerics.default_device import device_of
@@ -29,7 +29,7 @@ from ...numerics.exponential_step import (
     fewest_steps,
 )
 from ...numerics.quantiles import known_quantile
-from ...numerics.runge_kutta import exponential, stage_weights
+from ...numerics.runge_kutta import exponential, runge_kutta_loop, stage_weights
 from ...systems import Clocked, Plant, StepPlant
 from .cost import Cost, quadratic
 from .held_linear import periods
@@ -58,10 +58,6 @@ def fewest_and_most(call: str, substeps: int | tuple[int, int]) -> tuple[int, in
         integer(call, "substeps", least, least=1),
         integer(call, "substeps", most, least=least),
     )
-
-
-RungeKuttaSums = tuple[Tensor, Tensor, Tensor]
-"""The slope of the last stage, the sum of what the slopes count, and what was paid."""
 
 
 class Holding:
@@ -235,7 +231,7 @@ class Holding:
         def field(at: Tensor) -> tuple[Tensor, Tensor]:
             return plant.velocity(at, u), none if cost is None else none + cost.state_rate(at)
 
-        return runge_kutta_loop(plant, field, x, h, self.discount, watch)
+        return runge_kutta_loop(plant.displaced, field, x, h, self.discount, watch)
 
     def _exponential(self, x: Tensor, u: Tensor, h: float, watch: bool) -> tuple[Tensor, ...]:
         plant, cost, table, none = self.plant, self.cost, self.table, torch.zeros_like(x[..., 0])
@@ -423,37 +419,3 @@ def _quadratic(cost: Cost) -> bool:
     kind = type(cost)
     own = kind.state_rate is not Cost.state_rate or kind.deviation is not Cost.deviation
     return not (own or cost.output is not None or cost.periodic)
-
-
-def runge_kutta_loop(
-    plant: Plant,
-    field: Callable[[Tensor], tuple[Tensor, Tensor]],
-    x: Tensor,
-    length: float | Tensor,
-    discount: float = 0.0,
-    watch: bool = False,
-) -> tuple[Tensor, ...]:
-    """`numerics.runge_kutta` as a loop over the stages, of which a program then contains one.
-
-    Args:
-        plant: whose states these are.
-        field: the velocity and the cost rate at a state.
-        x: (..., n).
-        length: s, a number or one a row.
-        discount: 1/s, of what is paid.
-        watch: whether to return `Holding.watched`'s number, too.
-
-    Returns:
-        x+ (..., n) and what was paid, (...).
-    """
-
-    def stage(now: RungeKuttaSums, share: tuple[Tensor, Tensor, Tensor]) -> tuple[RungeKuttaSums, Any]:
-        slope, moved, paid = now
-        ahead, count, value = share
-        slope, rate = field(plant.displaced(x, ahead * slope))
-        return (slope, moved + count * slope, paid + value * rate), slope if watch else ()
-
-    start = torch.zeros_like(x), torch.zeros_like(x), torch.zeros_like(x[..., 0])
-    (_, moved, paid), slopes = scan(stage, start, stage_weights(length, discount, x), dim=0)
-    after = plant.displaced(x, moved)
-    return (after, paid, length * (slopes[2] - slopes[1]).abs().amax(-1)) if watch else (after, paid)

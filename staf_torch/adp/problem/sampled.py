@@ -13,9 +13,9 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from ...lanes import each, traced_as
+from ...lanes.each_row import first_row
 from ...lanes.gradients import without_gradient
 from ...lanes.row_decisions import in_any_row
-from ...lanes.row_numbers import first_row
 from ...lanes.row_objects import Note, OfRows
 from ...numerics.angles import turned, unwrapped, wrap
 from ...numerics.checks import fail, integer, trailing

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import ClassVar, NamedTuple
 
 import torch
@@ -14,6 +16,7 @@ from ...numerics.default_device import device_of
 from ...numerics.runge_kutta import runge_kutta_mean, runge_kutta_stages
 from ...systems import Barrier, Bounds
 from ..loop.controller import Policy
+from .conditions import Constraint
 from .quadratic_program import cases, nearest_admissible, sides_of
 
 _LEFT, _LEAST = (
@@ -271,3 +274,21 @@ def _degrees(box: Barrier) -> list[int]:
         effects = torch.func.grad(speed, argnums=1)(x, rest), torch.func.grad(pushed)(rest)
         found.append(next((n for n, one in enumerate(effects, 1) if bool((one.abs() > _NOTHING).any())), 0))
     return found
+
+
+def walls(low: Sequence[float], high: Sequence[float]) -> list[Constraint]:
+    """h of every coordinate with a wall, in its units: (x - low)(high - x)/(high - low), or the distance to
+    its one wall.
+
+    Args:
+        low: of the n coordinates, -inf for no wall.
+        high: likewise, inf for none.
+    """
+    pairs = enumerate(zip(low, high, strict=True))
+    return [_within(k, *pair) for k, pair in pairs if not all(map(math.isinf, pair))]
+
+
+def _within(k: int, low: float, high: float) -> Constraint:
+    if math.isinf(low) or math.isinf(high):
+        return lambda x, t: high - x[:, k] if math.isinf(low) else x[:, k] - low
+    return lambda x, t: (x[:, k] - low) * (high - x[:, k]) / (high - low)

@@ -433,21 +433,3 @@ class SafetyFilter(Controller):
         effect = torch.where(second, 0.5 * self.hold * effect, effect).amax(-1) * self.hold
         further = short / torch.where(effect > 0, effect, 1.0)
         return torch.where(further > 2 * INFEASIBLE, further, 2 * INFEASIBLE)
-
-
-def walls(low: Sequence[float], high: Sequence[float]) -> list[Constraint]:
-    """h of every coordinate with a wall, in its units: (x - low)(high - x)/(high - low), or the distance to
-    its one wall.
-
-    Args:
-        low: of the n coordinates, -inf for no wall.
-        high: likewise, inf for none.
-    """
-    pairs = enumerate(zip(low, high, strict=True))
-    return [_within(k, *pair) for k, pair in pairs if not all(map(math.isinf, pair))]
-
-
-def _within(k: int, low: float, high: float) -> Constraint:
-    if math.isinf(low) or math.isinf(high):
-        return lambda x, t: high - x[:, k] if math.isinf(low) else x[:, k] - low
-    return lambda x, t: (x[:, k] - low) * (high - x[:, k]) / (high - low)

@@ -18,8 +18,8 @@ from torch import Tensor
 from torch._decomp import decomposition_table
 from torch.overrides import TorchFunctionMode
 
-from ..call import Given
 from ..emit.schedule import Sizes
+from ..given import Given
 from ..loops import tracing
 from ..row_numbers import RowNumbers, resolving
 from ..tree import Shared, Tree, flatten, plain

@@ -15,7 +15,7 @@ from helpers import tensor, uniform
 from torch import Tensor
 
 from staf_torch import adp, deploy, systems
-from staf_torch.adp.safety.safety_filter import walls
+from staf_torch.adp.safety.box_filter import walls
 from staf_torch.deploy.c_header import runner_c
 
 LINE = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])

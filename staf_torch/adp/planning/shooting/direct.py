@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-import math
 from collections.abc import Callable, Sequence
 
 import torch
@@ -11,40 +9,34 @@ from torch import Tensor
 
 from ....lanes.gradients import without_gradient
 from ....lanes.opaque import opaque
-from ....lanes.row_decisions import decided, numbers_of_rows
 from ....lanes.row_numbers import over_rows, points_of_rows, some_rows
 from ....lanes.row_objects import made_by_rows
 from ....numerics.checks import fail, integer, positive_real, trailing
 from ....numerics.default_device import beside, on_cpu
-from ....numerics.linalg import Matrix, positive_semidefinite, square
+from ....numerics.linalg import Matrix
 from ....signs import Sign
 from ....systems import ControlAffineSystem, Linear, Plant
 from ....systems.bounds import Limit
 from ...loop.controller import LQR, Policy, Value
 from ...problem.bounded_input_cost import BoundedInputCost
-from ...problem.cost import Cost, QuadraticCost, quadratic
+from ...problem.cost import Cost, QuadraticCost
 from ...problem.rules import (
-    check_regulates,
     check_still,
     check_torch,
     check_undiscounted,
     restless,
     set_point,
 )
-from ...problem.shapes import check_policy, check_problem, check_value
+from ...problem.shapes import check_policy, check_problem
 from ..trajectories import Trajectories, chosen
+from .defaults import MOST, end_value, regulator, times
 from .merging import ROWS, cheapest, dearer, joined, merged, replaced, selected
-from .mesh import graded, halved, rates_of, split
+from .mesh import graded, halved, split
 from .newton import Interval, MeshPlan, NewtonSolution, follow, minimise, replay, why_none
 from .optimum import Optimum
 from .plan_search import PlanSearch
 from .starts import guesses, guided
 
-_log = logging.getLogger(__name__)
-_DECAY = 9.2  # time constants of the slowest mode in the horizon: it falls to 1e-4
-_RESOLVED = 0.5  # mean interval in time constants of the fastest mode
-_LEAST = 80  # intervals
-_MOST = 120  # intervals that are chosen at most where inputs are bounded
 _GAP = 1e-3  # share of the value by which a stationary control may miss the minimum of the Hamiltonian
 _NEAR = (0.5, 2.0)  # value over the LQR's, inside which one start is believed,
 _PLAIN = 1.5  # where following the base costs at most so many times what was found from it
@@ -137,11 +129,8 @@ class DirectShooting:
         starts: int = 6,
         seed: int = 0,
     ) -> None:
-        system, cost, terminal = (
-            on_cpu(system),
-            on_cpu(cost),
-            on_cpu(terminal),
-        )  # a search that branches on values
+        # On the CPU: a search that branches on values.
+        system, cost, terminal = on_cpu(system), on_cpu(cost), on_cpu(terminal)
         base = on_cpu(base) if base is None or callable(base) else [on_cpu(each) for each in base]
         check_torch("DirectShooting", "system", system, continuous=True)
         check_still("DirectShooting", "system", system, "`BoxDDP`")
@@ -151,31 +140,19 @@ class DirectShooting:
         check_undiscounted("DirectShooting", cost)
         check_problem(system, cost)
         self.stage = Interval(system, cost)
-        rates = (1.0, 0.0)
         self.lqr: LQR | None = None
         if base is None or terminal is None or horizon is None or intervals is None:
-            self.lqr = self._regulator(horizon, terminal is None and cost.ending is None)
-            if (lqr := self.lqr) is not None:
-                slow, fast = numbers_of_rows(lambda: rates_of(system, lqr)).numbers
-                rates = float(slow.min()), float(fast.max())
+            self.lqr = regulator(system, cost, horizon, terminal is None and cost.ending is None)
         given = () if base is None else tuple(base) if isinstance(base, Sequence) else (base,)
         if not given or (len(given) > 1 and self.lqr is not None):
             given = (*given, self._resting if self.lqr is None else self.lqr)
         check_policy("DirectShooting", "base", cost, *given)
         self.bases, self.alone = given, base is None and self.lqr is None
-        self.terminal = self._end(terminal)
+        self.terminal = end_value(terminal, cost, self.lqr)
         self.stays = made_by_rows(self._stays)  # 1 where the optimum at the set-point is to stay, else 0
         self.quadratic_end = not callable(cost.ending if terminal is None else terminal)
         self.stated = (horizon, intervals)
-        chosen = _DECAY / rates[0] if horizon is None else horizon
-        self.horizon = positive_real("DirectShooting", "horizon", chosen)
-        if intervals is None:
-            wanted = self.horizon * rates[1] / _RESOLVED
-            most = math.inf if cost.bounds is None else _MOST
-            intervals = 2 * round(0.5 * min(max(_LEAST, wanted), most))
-        self.intervals = integer("DirectShooting", "intervals", intervals, least=4)
-        if self.intervals % 2:
-            raise fail("DirectShooting", "intervals", "must be even", intervals)
+        self.horizon, self.intervals = times(system, cost, self.lqr, horizon, intervals)
         self.tolerance = positive_real("DirectShooting", "tolerance", tolerance)
         steps = (50 if cost.bounds is None else 120) if iterations is None else iterations
         self.iterations = integer("DirectShooting", "iterations", steps, least=1)
@@ -188,59 +165,11 @@ class DirectShooting:
         ends = self.terminal(set_point(system, cost)[0].unsqueeze(0)).abs()
         return float(bool(ends <= _NOTHING) and not restless(system, cost))
 
-    def _regulator(self, horizon: float | None, ends: bool) -> LQR | None:
-        """The LQR of the problem; None where there is none and a horizon does without.
-
-        Args:
-            horizon: s, as it was given.
-            ends: whether a plan would end with its value.
-        """
-        cost, system = self.stage.cost, self.stage.system
-        try:
-            decided(lambda: check_regulates("DirectShooting", system, cost))
-            return LQR(system, cost)
-        except ValueError as error:
-            why = str(error)
-        if horizon is None:
-            raise ValueError(
-                f"`DirectShooting(horizon=...)` must be given, in s, where there is no LQR: {why} "
-                "Give a `terminal` as well, V_T of x or S of e'Se, where the end is to count."
-            )
-        if ends:
-            _log.warning(
-                "`DirectShooting` has no LQR (%s): the end of a plan costs nothing: give `terminal`, V_T of x"
-                " or S of e'Se, or a horizon after which nothing counts.",
-                why,
-            )
-        return None
-
     def _resting(self, x: Tensor) -> Tensor:
         """The input of the set-point, within the bounds: (..., n) -> (..., m)."""
         cost = self.stage.cost
         u = cost.input_of(x.new_zeros(*x.shape[:-1], cost.inputs))
         return cost.admissible(u)
-
-    def _end(self, terminal: Value | Matrix | None) -> Value:
-        """V_T: as given, of the cost, of the LQR, or nothing."""
-        cost = self.stage.cost
-        if terminal is None:
-            if cost.ending is not None:
-                return cost.terminal
-            return (lambda x: torch.zeros_like(x[..., 0])) if self.lqr is None else self.lqr.value
-        if callable(terminal):
-            own = check_value("DirectShooting", "terminal", terminal, cost)
-        else:
-
-            def checked() -> Tensor:
-                end = square("DirectShooting", "terminal", terminal, cost.dim)
-                return positive_semidefinite("DirectShooting", "terminal", end, cost.dim)
-
-            end = made_by_rows(checked)
-
-            def own(x: Tensor) -> Tensor:
-                return quadratic(end, cost.deviation(x))
-
-        return lambda x: over_rows(own, x)
 
     def __repr__(self) -> str:
         over = f"{self.intervals} intervals over {self.horizon:.4g} s, {self.starts} starts"
@@ -282,7 +211,7 @@ class DirectShooting:
                 break
             horizon *= 2
             if self.stated[1] is None:
-                intervals = max(intervals, min(2 * intervals, _MOST))
+                intervals = max(intervals, min(2 * intervals, MOST))
         return found
 
     def _over(self, x0: Tensor, horizon: float, intervals: int, warm: Optimum | None) -> Optimum:
