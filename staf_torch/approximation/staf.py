@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn.utils import parametrize
 
 from ..lanes.gradients import refuse_gradient
 from ..lanes.one_thread import alone
@@ -153,10 +154,12 @@ class StaF(nn.Module):
             x = _wide(x.to(self.state))
             self.basis.check_reach(x)
             coefficients = self.basis.local(x).fit(self.basis.values(x, target, self.out_features))
+            coefficients = coefficients if self.out_features is None else coefficients.movedim(0, -2)
             self.state.copy_(x)
-            self.coefficients.copy_(
-                coefficients if self.out_features is None else coefficients.movedim(0, -2)
-            )
+            if "parametrizations" in self._modules and parametrize.is_parametrized(self, "coefficients"):
+                self.coefficients = coefficients  # type: ignore[assignment]  # by its right inverse
+            else:
+                self.coefficients.copy_(coefficients)
         self._remember(target)
         return self
 
@@ -359,7 +362,8 @@ class StaF(nn.Module):
         clone = self.__class__.__new__(self.__class__)
         memo[id(self)] = clone
         target = self._target  # a function of the user's: shared, not copied
-        clone.__dict__.update({name: copy.deepcopy(v, memo) for name, v in self.__getstate__().items()})
+        held = vars(self) | {"_target": None}
+        clone.__dict__.update({name: copy.deepcopy(v, memo) for name, v in held.items()})
         clone._remember(target)
         return clone
 

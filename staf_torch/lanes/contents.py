@@ -29,6 +29,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.nn.utils import parametrize
 
 from .lookups import EMPTY, OF_PYTHON, Lookup, attribute_parts, content_of, installed, is_users, lookups
 from .row_numbers import RowNumbers, all_rows
@@ -216,7 +217,7 @@ def _is_layer(kind: type) -> bool:
 
 def _makes_parameters(kind: type) -> bool:
     root, _, rest = kind.__module__.partition(".")
-    return kind is not nn.Module and (
+    return kind not in (nn.Module, parametrize.ParametrizationList) and (
         root == "torch" or (root == _PACKAGE and rest.startswith("approximation"))
     )
 
@@ -312,11 +313,14 @@ class Walk(pickle.Pickler):
     def reducer_override(self, value: Any) -> Any:
         if isinstance(value, nn.Module):
             kind: Any = type(value)  # which has a hash
+            attributes, owners = vars(value), [value]
+            if "parametrizations" in value._modules and parametrize.is_parametrized(value):
+                kind = parametrize.type_before_parametrizations(value)  # torch's of it refuses to be written
+                owners += value.parametrizations.values()
             if _is_layer(kind):
-                self.layers.update(map(id, value._parameters.values()))
-            attributes = vars(value)
+                self.layers.update(id(part) for owner in owners for part in owner._parameters.values())
             plain = kind.__getstate__ is object.__getstate__ and not kind.__dict__.get("__slotnames__", True)
-            whole = attributes if plain else value.__getstate__()
+            whole = attributes if plain else kind.__getstate__(value)
             state = {k: v for k, v in whole.items() if k not in _UNREAD}
             for hooks in _HOOKS:  # whose keys count all hooks of the process
                 if state.get(hooks):
@@ -328,7 +332,7 @@ class Walk(pickle.Pickler):
             self.modules.append(
                 (attributes, [k for k in attributes if k in state and k not in _OF_EVERY_MODULE])
             )
-            return copyreg.__newobj__, (type(value),), state  # type: ignore[attr-defined]
+            return (copyreg.__newobj__, (kind,), state) if kind is type(value) else (kind, (), state)  # type: ignore[attr-defined]
         held = getattr(value, "__dict__", ())
         if BOUND in held or (held and self._telling and getattr(type(value), "told", ())):
             made = list(value.__reduce_ex__(2))

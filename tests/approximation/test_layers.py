@@ -17,6 +17,7 @@ from variants import LEARNABLE_KERNELS, SMOOTH_KERNELS, by_turns, learned, over
 from variants import RADII as FIXED_RADII
 
 import staf_torch as st
+from staf_torch.lanes.contents import Contents
 from staf_torch.targets import Paper
 
 BATCHES = ((), (4,), (2, 3))
@@ -201,18 +202,58 @@ def test_parameters_are_learned_and_tensors_are_fixed(name: str) -> None:
     assert "coefficients" in frozen.state_dict()
 
 
-def test_a_parametrised_width_is_constrained_and_learned() -> None:
-    class Exp(nn.Module):
-        def forward(self, raw: torch.Tensor) -> torch.Tensor:
-            return raw.exp()
+class _Exp(nn.Module):
+    def forward(self, raw: torch.Tensor) -> torch.Tensor:
+        return raw.exp()
 
-    kernel = st.GaussianKernel(learned(0.8))
-    nn.utils.parametrize.register_parametrization(kernel, "width", Exp(), unsafe=True)
-    staf = st.StaF(st.StaFBasis(kernel, st.StateFollowingCenters(st.rings(3), 0.3)))
+    def right_inverse(self, value: torch.Tensor) -> torch.Tensor:
+        return value.log()
+
+
+def _parametrised(width: float) -> st.StaF:
+    kernel = st.GaussianKernel(learned(width))
+    nn.utils.parametrize.register_parametrization(kernel, "width", _Exp())
+    return st.StaF(st.StaFBasis(kernel, st.StateFollowingCenters(st.rings(3), 0.3)))
+
+
+def test_a_parametrised_width_is_learned_copied_and_loaded() -> None:
+    staf = _parametrised(0.8)
+    kernel = staf.basis.kernel
     y = staf.fit_(tensor([0.4, 0.3]), Paper()).state.unsqueeze(0) + 0.1
     staf(y).sum().backward()
-    assert float(kernel.width.detach()) == pytest.approx(2.718281828459045**0.8)
+    assert float(kernel.width.detach()) == pytest.approx(0.8)
     assert float(kernel.parametrizations.width.original.grad) != 0
+    other = copy.deepcopy(staf)
+    loaded = _parametrised(0.5)
+    loaded.load_state_dict(staf.state_dict())
+    assert torch.equal(other(y), staf(y))
+    assert torch.equal(loaded(y), staf(y))
+    with torch.no_grad():
+        kernel.parametrizations.width.original.add_(0.1)
+    assert torch.equal(other(y), loaded(y))
+    assert not torch.equal(other(y), staf(y))
+    with pytest.raises(RuntimeError, match="state_dict"):  # torch's own rule
+        pickle.dumps(staf)
+
+
+def test_parametrised_coefficients_are_fitted_and_copied() -> None:
+    class Twice(nn.Module):
+        def forward(self, raw: torch.Tensor) -> torch.Tensor:
+            return 2 * raw
+
+        def right_inverse(self, value: torch.Tensor) -> torch.Tensor:
+            return value / 2
+
+    staf, plain = fixed("gaussian"), fixed("gaussian")
+    nn.utils.parametrize.register_parametrization(staf, "coefficients", Twice())
+    y = plain.fit_(tensor([0.4, 0.3]), Paper()).state.unsqueeze(0) + 0.1
+    staf.fit_(plain.state, Paper())
+    assert torch.equal(staf(y), plain(y))
+    assert torch.equal(copy.deepcopy(staf)(y), plain(y))
+
+
+def test_modules_of_one_parametrisation_share_their_programs() -> None:
+    assert Contents(_parametrised(0.8)).key == Contents(_parametrised(0.5)).key is not None
 
 
 @over(FIXED)
