@@ -32,11 +32,46 @@ FIRST, EVERY = 1.5, 10.0
 _LOOK = 0.25  # s
 _BAR = 24  # characters
 _TELLING = 0.05  # share done, from which the time left is told
+_MARKS = 64  # most that a `Pace` keeps
 _open: dict[int, list[Sign]] = {}  # of each thread, from the outermost call in
 _lock = threading.RLock()
 _mine = threading.local()
 _watch: threading.Thread | None = None
 _drawn = False  # whether a terminal shows a line that is to be wiped
+
+
+class Pace:
+    """Time left by the latter half of the steps that are done, the first of which compiles and loads.
+
+    Example:
+        >>> from staf_torch.signs import Pace
+        >>> pace = Pace()
+        >>> for k in range(1, 4):
+        ...     pace.note(k, 10)
+        >>> pace.left(10) < 1.0
+        True
+    """
+
+    def __init__(self) -> None:
+        self._marks: list[tuple[float, float]] = []  # (s, steps), a `_MARKS`-th of the total or more apart
+        self.due = 0.0  # steps, from which there is something to note
+
+    def note(self, done: float, total: float) -> None:
+        """Note that so many steps of the total are done now."""
+        if done > self.due:
+            self._marks.append((time.monotonic(), done))
+            self.due = done + max(total / _MARKS - 1e-9, 0.0)
+
+    def left(self, total: float) -> float | None:
+        """Return the time left (s); None as long as one step alone has been noted."""
+        if len(self._marks) < 2:
+            return None
+        last, done = self._marks[-1]
+        start, before = next((mark for mark in self._marks[-2::-1] if mark[1] <= done / 2), self._marks[0])
+        late, spent = time.monotonic() - last, last - start
+        if late > spent:  # the step that is going on takes long: it slows the pace
+            late, spent = 0.0, spent + late
+        return max(0.0, (total - done) * spent / (done - before) - late)
 
 
 class Sign:
@@ -62,7 +97,7 @@ class Sign:
         self, what: str | Callable[[], str], total: float = 0, unit: str = "steps", *, log: bool = True
     ) -> None:
         self._what, self.total, self.unit, self._log = what, total, unit, log
-        self.done, self._began, self._said = 0.0, 0.0, -EVERY
+        self.done, self._began, self._said, self._pace = 0.0, 0.0, -EVERY, Pace()
 
     def __call__(self, function: Callable[_P, _R]) -> Callable[_P, _R]:
         """Decorate a function of which each call has a sign of its own."""
@@ -99,6 +134,8 @@ class Sign:
     def advance(self, steps: float = 1) -> None:
         """Count steps that are done."""
         self.done += steps
+        if self.done > self._pace.due and self.total:
+            self._pace.note(self.done, self.total)
 
     @property
     def share(self) -> float:
@@ -113,9 +150,8 @@ class Sign:
             return what()
         if not 0 < share < 1:
             return what
-        left = (time.monotonic() - self._began) * (1 - share) / share
-        far = f"{100 * share:.0f} % of {self.total:g} {self.unit}"
-        if share >= _TELLING:  # before, most of the time went into compiling and loading
+        far, left = f"{100 * share:.0f} % of {self.total:g} {self.unit}", self._pace.left(self.total)
+        if share >= _TELLING and left is not None:
             far += f", {left:.0f} s left"
         return f"{what}: {far}" if what else far
 

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..kernels import Kernel
 from ..lanes.call import seen_by_others
 from ..lanes.locks import ReadWriteLock
 from ..lanes.opaque import opaque
@@ -20,7 +21,7 @@ from ..numerics.default_device import beside, on
 from ..signs import Sign
 from .compiled_filter import DirectCalls
 from .samples import in_place, lapse_of, lapses, like_given, pair, single, tensor_of
-from .scikit_estimator import NotFittedError, ScikitEstimator, parameters
+from .scikit_estimator import NotFittedError, ScikitEstimator, parameters, told_kernel
 
 _ABOUT = ("n_features_in_", "n_streams_", "n_outputs_")
 _DTYPES = {str(dtype): dtype for dtype in (torch.float32, torch.float64)}
@@ -62,7 +63,8 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         n_streams_: S, or None for a single stream without batch dimension.
         n_outputs_: K, or None for y without a dimension of its own.
         n_samples_seen_: samples that each stream has learned from, () or (S,).
-        n_skipped_: samples that were not learned, () or (S,).
+        n_skipped_: samples that were not learned, () or (S,): without a target, with all of x NaN or a
+            coordinate that was never measured, not finite, or out of proportion.
     """
 
     __slots__ = ("_lock",)  # no part of what a copy or scikit-learn sees of an estimator
@@ -86,7 +88,7 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
 
     @abc.abstractmethod
     def _decisive(self) -> tuple[str, ...]:
-        """Return the names of the arguments that what was learned depends on."""
+        """Return the names of the arguments that what was learned depends on, but for tensors."""
 
     @opaque
     def fit(self, x: Any, y: Any, time: Any = None) -> Self:
@@ -368,9 +370,13 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         """Take over what `_extra_state` gave."""
 
     def _plain_arguments(self) -> dict[str, Any]:
-        """Return decisive arguments that are numbers, flags or None; floats, as a search's may be NumPy's."""
+        """Return decisive arguments that are numbers, flags, kernels or None; floats, as a search's may be
+        NumPy's, and a kernel's class and numbers."""
         found = {name: single(getattr(self, name)) for name in self._decisive()}
-        real = {k: float(v) for k, v in found.items() if isinstance(v, numbers.Real | np.bool_)}
+        real: dict[str, Any] = {
+            k: float(v) for k, v in found.items() if isinstance(v, numbers.Real | np.bool_)
+        }
+        real |= {k: told_kernel(v) for k, v in found.items() if isinstance(v, Kernel | str)}
         return {k: real.get(k) for k, v in found.items() if v is None or k in real}
 
     def load_state_dict(self, state: dict[str, Any]) -> Self:
@@ -385,6 +391,10 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         if missing or state["dtype"] not in _DTYPES:
             told = f"it has no {missing}" if missing else f"its dtype is {state['dtype']!r}"
             raise ValueError(f"`{name}(state=...)` must be what `state_dict` returned; {told}.")
+        for key in ("n_features_in_", "n_outputs_") if self.__sklearn_is_fitted__() else ():
+            if (mine := getattr(self, key)) != (its := state[key]):
+                told = f"it has {key}={its}, this one has learned with {mine}: call `reset` before"
+                raise ValueError(f"`{name}(state=...)` must be of streams like those learned: {told}.")
         streams, outputs, dtype = state["n_streams_"], state["n_outputs_"], _DTYPES[state["dtype"]]
         twin = type(self)(**self.get_params(deep=False))
         twin._take_extra(state)

@@ -158,7 +158,7 @@ class FilterStreams:
         waited = torch.where(young, self.first[every, place, -1], 0.0)  # since the last usable one
         self.first[every, place, -1] = waited + lapses
         rows = usable.nonzero().squeeze(1)
-        self.first[rows, place[rows], :-1] = both[rows]
+        self.first[rows, place[rows], :-1] = self._with_held(both[rows], rows)
         self.turn = torch.where(usable & ~young, (self.turn + 1) % kept, self.turn)
         self.clock += usable & young
         return (
@@ -168,6 +168,21 @@ class FilterStreams:
                 self.clock, torch.tensor(LEARNED_AT, dtype=self.clock.dtype, device=self.clock.device)
             )
         )
+
+    def _with_held(self, both: Tensor, rows: Tensor) -> Tensor:
+        """Put what a stream holds in place of coordinates that no kept sample has: (R, n + K) of these rows.
+
+        They were measured in samples that were not kept, having no target; who learns the kept ones again
+        would not know them.
+        """
+        n = self.state.dim
+        lost = both[:, :n].isnan()
+        if not bool(lost.any()):  # costs time alone
+            return both
+        held = self.state.parts(self.state.table[:, rows].double()).last.mT
+        held = held * self._spread[rows, :n] + self._center[rows, :n]
+        lost &= self.first[rows, :, :n].isnan().all(1)
+        return torch.cat((torch.where(lost, held, both[:, :n]), both[:, n:]), 1)
 
     def _grow(self) -> None:
         """Give a coordinate that moves by far more than its unit a larger one, and learn the latest again."""

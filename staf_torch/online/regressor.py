@@ -125,7 +125,7 @@ class StaFRegressor(StreamEstimator):
 
     @property
     def tuning(self) -> Tuning | None:
-        """Return the hyperparameters that `tune` found, None before."""
+        """Return the hyperparameters that `tune` found, a table when printed; None before."""
         return self._tuning
 
     @Sign("StaFRegressor.tune")
@@ -134,10 +134,11 @@ class StaFRegressor(StreamEstimator):
 
         Width (a coordinate each), noise, forgetting and radius, Gaussian kernel, by the one-step predictive
         likelihood: all candidates are streams of one tensor batch. They take the place of ``kernel``,
-        ``radius``, ``noise``, ``amplitude``, ``forgetting`` and ``scaling`` wherever as many streams with as
-        many outputs are learned; the radius is one for all streams, that of the first. What was learned
-        before is forgotten. A coordinate that hardly moves in the stretch gets the width of the others;
-        one that covers little of its width is logged.
+        ``radius``, ``noise``, ``amplitude``, ``forgetting`` and ``scaling`` for as many streams, coordinates
+        and outputs; others are refused. The radius is one for all streams, that of the first. The stretch is
+        not learned: `fit` or `partial_fit` come after it. What was learned before is forgotten, and that is
+        logged. `print(model.tuning)` shows what was tried and chosen. A coordinate that hardly moves in the
+        stretch gets the width of the others; one that covers little of its width is logged.
 
         Args:
             x: (T, n), one stream in time, or (T, S, n), S streams; some hundred samples.
@@ -167,6 +168,12 @@ class StaFRegressor(StreamEstimator):
         return self
 
     def _hold(self, found: Tuning) -> None:
+        if self.__sklearn_is_fitted__():
+            _log.warning(
+                "`StaFRegressor.tune` forgets what was learned before, up to %d samples a stream: call `fit` "
+                "or `partial_fit` from the first sample on",
+                int(self._streams_.learned.max()),
+            )
         self._reset()
         self._tuning = found
 
@@ -259,9 +266,9 @@ class StaFRegressor(StreamEstimator):
 
     def _recorded_filter(self, streams: int, outputs: int, dim: int) -> LocalFilter:
         """Return the filter of tensors that autograd sees."""
-        toward, found = self._directions(dim), self._tuning
+        toward, found = self._directions(dim), self._tuned(streams, dim, outputs)
         robust = math.inf if self.robust is None else self.robust
-        if found is not None and found.center.shape == (streams, dim + outputs):
+        if found is not None:
             radius = found.radius[:1].expand(streams)
             tuned = own_functions(_NAME, GaussianKernel(1.0), radius, toward)
             slack = float(single(self.follow)) * radius
@@ -278,6 +285,21 @@ class StaFRegressor(StreamEstimator):
             functions = LocalFunctions.of(kernel, law["radius"][0] * toward)
         return LocalFilter(functions, ratio, law["forgetting"], slack, law["robust"], base)
 
+    def _tuned(self, streams: int, dim: int, outputs: int) -> Tuning | None:
+        """Return what `tune` found, None before.
+
+        Raises:
+            ValueError: if it was for other streams.
+        """
+        if self._tuning is not None and self._tuning.sizes != (streams, dim, outputs):
+            was, now = (
+                f"{s} stream(s) of {n} coordinate(s) and {k} output(s)"
+                for s, n, k in (self._tuning.sizes, (streams, dim, outputs))
+            )
+            rule = "call `tune` for these, or take a new regressor"
+            raise ValueError(f"`{_NAME}` was tuned for {was}; got {now}: {rule}.")
+        return self._tuning
+
     def _begin(self, streams: int, outputs: int, like: Tensor) -> Streams:
         begun, angles = self._filters(streams, outputs, like), self._angles(len(like))
         if not angles:
@@ -292,14 +314,13 @@ class StaFRegressor(StreamEstimator):
 
     def _filters(self, streams: int, outputs: int, like: Tensor) -> FilterStreams:
         dim, dtype, toward = len(like), like.dtype, self._directions(len(like))
-        scaling, found = flag(_NAME, "scaling", self.scaling), self._tuning
+        scaling, found = flag(_NAME, "scaling", self.scaling), self._tuned(streams, dim, outputs)
         kernel, numbers = _kernel(self.kernel), {name: getattr(self, name) for name in NAMES}
         refuse_gradient(_NAME, **numbers)
-        tuned = found is not None and found.center.shape == (streams, dim + outputs)
-        if not tuned and has_rows(numbers, kernel):
+        if found is None and has_rows(numbers, kernel):
             return self._own_filters(kernel, numbers, toward, streams, outputs, like)
         robust = math.inf if self.robust is None else positive_real(_NAME, "robust", single(self.robust))
-        if found is not None and tuned:
+        if found is not None:
             self.centers_offsets_ = found.radius[0] * toward
             return tuned_streams(found, toward, dtype, robust, float(single(self.follow)))
         radius = positive_real(_NAME, "radius", single(self.radius))
@@ -363,14 +384,13 @@ class StaFRegressor(StreamEstimator):
         return found
 
     def _decisive(self) -> tuple[str, ...]:
-        if self._tuning is not None:
-            return ("count", "follow", "robust")
-        return ("radius", "count", "noise", "amplitude", "forgetting", "follow", "robust", "scaling")
+        held = ("forgetting", "follow", "robust", "scaling")
+        return ("kernel", "radius", "count", "noise", "amplitude", *held)
 
     def _resized(self, kept: Tensor | None = None) -> None:
         before = self.n_streams_ or 1
         super()._resized()
-        if self._tuning is not None and len(self._tuning.center) == before:  # else it is of other streams
+        if self._tuning is not None:
             new = self._streams_.count - before
             self._tuning = self._tuning.add(new) if kept is None else self._tuning.keep(kept)
 
@@ -383,7 +403,13 @@ class StaFRegressor(StreamEstimator):
             told = f"it has periodic={[*state.get('periodic', ())]}, this one {[*self.periodic]}"
             rule = "must be of a regressor with the same arguments"
             raise ValueError(f"`{_NAME}.load_state_dict(state=...)` {rule}: {told}.")
-        self._tuning = Tuning(**state["tuning"]) if "tuning" in state else None
+        found = state.get("tuning")
+        if found is not None and set(found) != set(Tuning._fields):
+            told = f"its 'tuning' has {[*found]}, not {[*Tuning._fields]}"
+            raise ValueError(
+                f"`{_NAME}.load_state_dict(state=...)` must be what `state_dict` returned; {told}."
+            )
+        self._tuning = None if found is None else Tuning(**found)
 
 
 def _check_reach(functions: LocalFunctions, radius: float) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from torch import Tensor
 
 from ..kernels import NAMED, Kernel
+from ..lanes.row_numbers import RowNumbers
 from ..numerics.checks import choice, fail
 
 
@@ -116,10 +117,25 @@ class NotFittedError(ValueError, AttributeError):
 def _arguments(kernel: Kernel) -> dict[str, Any]:
     """The arguments that a kernel was made with, as far as it keeps them by their names."""
     found = {name: getattr(kernel, name) for name in parameters(type(kernel)) if hasattr(kernel, name)}
-    return {k: float(v) if isinstance(v, Tensor) and v.dim() == 0 else v for k, v in found.items()}
+    single = {
+        k
+        for k, v in found.items()
+        if isinstance(v, Tensor) and not isinstance(v, RowNumbers) and v.dim() == 0
+    }
+    return {k: float(v.detach()) if k in single else v for k, v in found.items()}
+
+
+def told_kernel(kernel: Kernel | str) -> str:
+    """Return a kernel's class and the numbers that it was made with, as text; those of one by its name."""
+    known = NAMED[kernel]() if isinstance(kernel, str) and kernel in NAMED else kernel
+    if isinstance(known, str):
+        return known
+    told = [f"{name}={_shown(value)}" for name, value in _arguments(known).items()]
+    return f"{type(known).__name__}({', '.join(told)})"
 
 
 def _shown(value: Any) -> str:
+    value = value.full if isinstance(value, RowNumbers) else value
     arrays = isinstance(value, Tensor | np.ndarray) and value.ndim > 0
     return f"<{type(value).__name__} {tuple(value.shape)}>" if arrays else repr(value)
 

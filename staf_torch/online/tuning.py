@@ -43,11 +43,15 @@ LITTLE = 6.0  # nats, log of the number of candidates: what is worth less may be
 FAILS = 0.05  # share of samples that no candidate need explain
 BROAD = 3.0  # standard deviations of y: width of the density that explains these
 MOST = 1e100  # spreads from the center beyond which a value is none
+_SHOWN = 12  # widths that a printed tuning has lines for
 HARDLY = 0.02  # widths of the other coordinates: one that covers less hardly moves
 
 
 class Tuning(NamedTuple):
-    """Hyperparameters from a stretch, a row a stream; the kernel's width is 1 in these units of x."""
+    """Hyperparameters from a stretch, a row a stream; the kernel's width is 1 in these units of x.
+
+    Printed it is a table of what was chosen, in units of x and y, beside the grid that was tried.
+    """
 
     center: Tensor  # (S, n + K)
     spread: Tensor  # (S, n + K)
@@ -57,6 +61,45 @@ class Tuning(NamedTuple):
     likelihood: Tensor  # (S,) log of the one-step predictive density, a sample, y in standard deviations
     width: Tensor  # (S, n) in standard deviations of x; where these say nothing, that of the others
     unknown: Tensor  # (S, n) float64, 1 where the stretch says nothing about a width: it may grow
+    untuned: Tensor  # (S,) likelihood by the defaults of `StaFRegressor(scaling=True)`
+
+    @property
+    def sizes(self) -> tuple[int, int, int]:
+        """S, n and K, for which these hold."""
+        streams, n = self.width.shape
+        return streams, n, self.center.shape[1] - n
+
+    def __repr__(self) -> str:
+        """Show the median of the streams, and the least and the largest."""
+        (streams, n, outputs), root = self.sizes, math.sqrt(self.width.shape[1])
+        head = f"Tuning of {streams} stream(s), n = {n}, {outputs} output(s), Gaussian kernel"
+        if streams > 1:
+            head += "; medians (least to largest)"
+        widths = f"{WIDTHS[0] * root:.3g} to {WIDTHS[-1] * root:.3g} std of x"
+        rows = [("", "chosen", "in standard deviations", "tried first; then around the best")]
+        for k in range(min(n, _SHOWN)):
+            shown = _spread_of(self.spread[:, k]), f"{_spread_of(self.width[:, k])} std of x[{k}]"
+            unknown = int(self.unknown[:, k].sum())
+            rows.append(
+                (f"width of x[{k}]", *shown, widths + (f"; {unknown} not told by x" if unknown else ""))
+            )
+        if n > _SHOWN:
+            rows.append((f"{n - _SHOWN} more widths", "in `.spread`", "in `.width`", widths))
+        noise = self.ratio.sqrt()
+        for k in range(outputs):
+            shown = _spread_of(noise * self.spread[:, n + k]), f"{_spread_of(noise)} std of y"
+            rows.append(
+                (f"noise of y[{k}]" if outputs > 1 else "noise of y", *shown, f"{_ends(NOISES)} std of y")
+            )
+        rows.append(("forgetting", _spread_of(self.forgetting), "a unit of time", _ends(FORGETTING)))
+        rows.append(
+            ("radius of centers", _spread_of(self.radius[:1]), "widths, for all streams", _ends(RADII))
+        )
+        gain = f"{_spread_of(self.untuned)} untuned (`scaling=True`)"
+        rows.append(("log density", _spread_of(self.likelihood), "nats a sample, y in std", gain))
+        wide = [max(len(row[k]) for row in rows) for k in range(3)]
+        lines = ["  ".join((*(f"{a:{w}}" for a, w in zip(row, wide, strict=False)), row[3])) for row in rows]
+        return "\n".join((head, *(line.rstrip() for line in lines)))
 
     def keep(self, rows: Tensor) -> Tuning:
         """Keep the streams with these numbers alone; the radius stays the one that serves all."""
@@ -68,6 +111,19 @@ class Tuning(NamedTuple):
         new = Tuning(*typical)
         new = new._replace(center=new.center * torch.nan, spread=new.spread * torch.nan)
         return Tuning(*(torch.cat(pair) for pair in zip(self, new, strict=True)))
+
+
+def _spread_of(values: Tensor) -> str:
+    """Return the median of finite values, and the least and the largest where these differ."""
+    seen = values[values.isfinite()]
+    if not len(seen):
+        return "learned as it goes"
+    median, least, most = (f"{float(value):.4g}" for value in (seen.median(), seen.min(), seen.max()))
+    return median if least == most else f"{median} ({least} to {most})"
+
+
+def _ends(tried: tuple[float, ...]) -> str:
+    return f"{min(tried):g} to {max(tried):g}"
 
 
 class _Candidates(NamedTuple):
@@ -107,21 +163,25 @@ def tuning(x: Tensor, y: Tensor, directions: Tensor, method: str = "search") -> 
         scores: Scores = _StretchScores(samples, n, radius * directions)
         if method == "search":
             scores = functools.partial(_scores, samples=samples, n=n, offsets=radius * directions)
-        best, score = (_searched if method == "search" else _ascended)(first, scores)
+        grid = scores(first)
+        best, score = (_searched if method == "search" else _ascended)(first, grid, scores)
         found.append((score, best, _unknown(best, score, scores)))
     which = torch.stack([score for score, *_ in found]).argmax(0)
     one = which == 1
     (small_score, small, small_unknown), (wide_score, wide_best, wide_unknown) = found
     kept = _Candidates(*(_choose(one, b, a).squeeze(1) for a, b in zip(small, wide_best, strict=True)))
     unknown = _choose(one, wide_unknown, small_unknown)
-    score = torch.where(one, wide_score, small_score) / (len(samples) - len(samples) // 3)
+    later = len(samples) - len(samples) // 3
+    score, untuned = torch.where(one, wide_score, small_score) / later, grid[:, -1] / later
     path = torch.where(seen, both, center)[..., :n]
     extent = path.amax(0) - path.amin(0)
     width, stretch, wider = _widened(kept.width, spread[:, :n], extent, unknown)
     _warn(extent / width, width, wider)
     units = torch.cat((width, spread[:, n:]), 1)
     radii = torch.tensor(RADII, dtype=torch.float64, device="cpu")[which]
-    found_ = Tuning(center, units, kept.noise**2, kept.forgetting, radii, score, stretch, unknown.double())
+    found_ = Tuning(
+        center, units, kept.noise**2, kept.forgetting, radii, score, stretch, unknown.double(), untuned
+    )
     return _untold(found_, samples[..., n:])
 
 
@@ -227,29 +287,29 @@ def _log_density(y: Tensor, mean: Tensor, deviation: Tensor) -> Tensor:
     return torch.where(torch.isnan(y), 0.0, found)
 
 
-def _best(candidates: _Candidates, scores: Scores) -> tuple[_Candidates, Tensor]:
+def _best(candidates: _Candidates, score: Tensor) -> tuple[_Candidates, Tensor]:
     """The candidate of each stream that predicts the later two thirds best, (S, 1), and its likelihood."""
-    score = scores(candidates)
     best = score.argmax(1)
     rows = torch.arange(len(best), device="cpu")
     return _Candidates(*(part[rows, best, None] for part in candidates)), score[rows, best]
 
 
-def _searched(first: _Candidates, scores: Scores) -> tuple[_Candidates, Tensor]:
+def _searched(first: _Candidates, grid: Tensor, scores: Scores) -> tuple[_Candidates, Tensor]:
     """The best of the grid and of candidates drawn around the best so far, (S, 1), and its likelihood."""
-    best, score = _best(first, scores)
+    best, score = _best(first, grid)
     draw = torch.Generator().manual_seed(0)
     for wide in ROUNDS:
-        again, better = _best(_around(best, wide, draw), scores)
+        around = _around(best, wide, draw)
+        again, better = _best(around, scores(around))
         gains = better > score
         best = _Candidates(*(_choose(gains, new, old) for new, old in zip(again, best, strict=True)))
         score = torch.where(gains, better, score)
     return best, score
 
 
-def _ascended(first: _Candidates, scores: Scores) -> tuple[_Candidates, Tensor]:
+def _ascended(first: _Candidates, grid: Tensor, scores: Scores) -> tuple[_Candidates, Tensor]:
     """The best of the grid and of what the gradient reaches from the best two, (S, 1), and its likelihood."""
-    score, which = scores(first).topk(STARTS, 1)
+    score, which = grid.topk(STARTS, 1)
     rows = torch.arange(len(which), device="cpu").unsqueeze(1)
     best = _Candidates(*(part[rows, which] for part in first))
     fades = (1 - best.forgetting).clamp(*FADES)

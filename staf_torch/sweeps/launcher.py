@@ -8,7 +8,6 @@ import functools
 import gc
 import logging
 import sys
-import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from ..results import run_record as records
 from ..results.files import METRICS, ROWS, RUN, partial_name
 from ..results.progress import Progress
 from ..settings.plain import ManySettings
-from ..signs import Sign, write
+from ..signs import Pace, Sign, write
 from . import lock, table, workers
 from .batching import Flat, Outcome, reason
 from .clusters import executor
@@ -67,7 +66,7 @@ class SweepProgress:
         self._total, self._before, self._done, self._failed = total, done, done, 0
         self._reasons: dict[str, tuple[str, int]] = {}  # the first job that failed so, and how many more did
         self._computed, self._running = 0.0, 0.0
-        self._start = time.monotonic()
+        self._pace = Pace()
         # Not the log: while a job is replayed, that is the job's own.
         self._sign = Sign(lambda: self.line, total, log=False)
         self._sign.__enter__()
@@ -105,10 +104,9 @@ class SweepProgress:
     def line(self) -> str:
         """`37 of 100 jobs done, 1 failed, 12 s left`."""
         failed = f", {self._failed} failed" if self._failed else ""
-        share = self._share
-        spent = time.monotonic() - self._start
-        left = f", {spent * (1 - share) / share:.0f} s left" if 0 < share < 1 else ""
-        return f"{self._done} of {self._total} jobs done{failed}{left}"
+        left = self._pace.left(1.0) if self._share < 1 else None
+        told = "" if left is None else f", {left:.0f} s left"
+        return f"{self._done} of {self._total} jobs done{failed}{told}"
 
     @property
     def _share(self) -> float:
@@ -118,6 +116,7 @@ class SweepProgress:
 
     def _show(self) -> None:
         self._sign.done = self._share * self._total
+        self._pace.note(self._share, 1.0)
 
 
 def job_name(num: int, overrides: Sequence[str]) -> str:

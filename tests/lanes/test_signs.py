@@ -27,8 +27,10 @@ class Terminal(io.StringIO):
 
 
 def long_call() -> None:
-    """Two rounds, in the second of which something is compiled."""
-    with Sign("a value", 2, "rounds") as sign:
+    """Four rounds: the first compiles, and says nothing of the time that the others take."""
+    with Sign("a value", 4, "rounds") as sign:
+        time.sleep(0.2)
+        sign.advance()
         sign.advance()
         with Sign("compiling 3 lines"):
             time.sleep(WAIT)
@@ -38,7 +40,7 @@ def test_a_line_says_what_is_going_on_and_how_far_it_is(capsys: pytest.CaptureFi
     long_call()
     out, err = capsys.readouterr()
     assert out == ""
-    assert err == "a value: 50 % of 2 rounds, 2 s left; compiling 3 lines (2 s so far)\n"
+    assert err == "a value: 50 % of 4 rounds, 3 s left; compiling 3 lines (2 s so far)\n"
 
 
 def test_a_log_that_takes_it_has_the_line_and_one_that_takes_nothing_none(
@@ -59,7 +61,8 @@ def test_a_terminal_has_a_bar_under_the_log_that_is_wiped_in_the_end(monkeypatch
     handler = logging.StreamHandler(shown)
     logging.getLogger().addHandler(handler)
     try:
-        with Sign("a sum", 4, "parts") as sign:
+        with Sign("a sum", 8, "parts") as sign:
+            sign.advance()
             sign.advance()
             while "a sum" not in shown.getvalue():
                 time.sleep(0.05)
@@ -68,7 +71,7 @@ def test_a_terminal_has_a_bar_under_the_log_that_is_wiped_in_the_end(monkeypatch
     finally:
         logging.getLogger().removeHandler(handler)
     found = shown.getvalue()
-    assert found.startswith("\r 25 %|######                  | a sum: 25 % of 4 parts, ")
+    assert found.startswith("\r 25 %|######                  | a sum: 25 % of 8 parts, ")
     assert "\r\x1b[Kabove\n\r 25 %|" in found
     assert found.endswith("\r\x1b[K")
 

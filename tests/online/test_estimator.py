@@ -27,15 +27,18 @@ def data(steps: int, *streams: int, outputs: int | None = None) -> tuple[torch.T
     return x, y if outputs is None else torch.stack([y * (k + 1) for k in range(outputs)], -1)
 
 
-def test_fit_and_tune_forget_what_was_learned() -> None:
+def test_fit_and_tune_forget_what_was_learned_and_say_so(caplog: pytest.LogCaptureFixture) -> None:
     x, y = data(12)
     model = st.StaFRegressor(radius=0.4)
     fresh = model.fit(x[:6], y[:6]).predict(x[-1])
     assert torch.equal(model.fit(x, y).fit(x[:6], y[:6]).predict(x[-1]), fresh)
     assert int(model.n_samples_seen_) == 6
-    for each in (model, mixture().fit(x, y)):
-        with pytest.raises(ValueError, match=r"Regressor.predict` needs a first sample"):
-            each.tune(x, y).predict(x[0])
+    with pytest.raises(ValueError, match=r"Regressor.predict` needs a first sample"):
+        model.tune(x, y).predict(x[0])
+    assert "tune` forgets what was learned before, up to 6 samples a stream: call `fit`" in caplog.text
+    mixed = mixture().fit(x, y)  # has nothing to tune
+    expected = mixed.predict(x[0])
+    assert torch.equal(mixed.tune(x, y).predict(x[0]), expected)
 
 
 def test_streams_that_are_not_there_cannot_go_come_or_begin_anew() -> None:
@@ -177,9 +180,23 @@ def test_a_state_is_that_of_the_last_arguments_and_of_nothing_before() -> None:
     assert torch.equal(model.predict(x[9]), wide.predict(x[9]))
     plain = st.StaFRegressor(radius=0.4).fit(x, y)
     tuned = st.StaFRegressor(radius=0.4).tune(x, y)
+    saved = tuned.fit(x, y).state_dict()
     tuned.load_state_dict(plain.state_dict())
     assert tuned.tuning is None
     assert torch.equal(tuned.predict(x[9]), plain.predict(x[9]))
+    for other, told in (
+        ({"radius": 0.3}, "radius=0.4, this one 0.3"),
+        ({"radius": 0.4, "kernel": "matern"}, "Matern"),
+    ):
+        with pytest.raises(ValueError, match=f"same arguments: it has .*{told}"):
+            st.StaFRegressor(**other).load_state_dict(saved)
+    with pytest.raises(
+        ValueError, match="it has n_features_in_=2, this one has learned with 1: call `reset`"
+    ):
+        st.StaFRegressor(radius=0.4).fit(x[:, :1], y).load_state_dict(saved)
+    less = {name: part for name, part in saved["tuning"].items() if name != "ratio"}
+    with pytest.raises(ValueError, match="must be what `state_dict` returned; its 'tuning' has"):
+        st.StaFRegressor(radius=0.4).load_state_dict(saved | {"tuning": less})
     unfitted = pickle.loads(pickle.dumps(st.StaFRegressor(radius=0.3)))
     assert repr(unfitted) == repr(st.StaFRegressor(radius=0.3))
     assert not unfitted.__sklearn_is_fitted__()
@@ -208,7 +225,7 @@ def test_a_state_that_lacks_something_is_refused_by_what_it_lacks() -> None:
         other = {**state["arguments"], "robust": 3.0}
         with pytest.raises(ValueError, match=rf"{told} be of .* it has robust=3.0, this one None"):
             model.load_state_dict(state | {"arguments": other})
-    assert all(value is None or type(value) is float for value in state["arguments"].values())
+    assert all(value is None or type(value) in (float, str) for value in state["arguments"].values())
 
 
 def model_of(**given: Any) -> Any:
@@ -227,16 +244,21 @@ def test_centers_are_directions_in_the_closed_ball() -> None:
             model_of(centers=wrong)
 
 
-def test_what_was_tuned_holds_for_as_many_streams_and_outputs_alone() -> None:
+def test_what_was_tuned_holds_for_as_many_streams_coordinates_and_outputs_alone() -> None:
     x, y = data(30)
     tuned = st.StaFRegressor(radius=0.4).tune(x, y)
     assert tuned.tuning is not None
     tuned.fit(x, y)
     torch.testing.assert_close(tuned.centers_offsets_, tuned.tuning.radius[0] * st.rings(6))
     assert torch.equal(tuned.state_dict()["ratio"], tuned.tuning.ratio)
-    for of_x, of_y in ((x[:, None].repeat(1, 2, 1), y[:, None].repeat(1, 2)), (x, torch.stack((y, y), 1))):
-        untuned = st.StaFRegressor(radius=0.4).fit(of_x, of_y)
-        assert torch.equal(tuned.fit(of_x, of_y).predict(of_x[3]), untuned.predict(of_x[3]))
+    others = (x[:, None].repeat(1, 2, 1), y[:, None].repeat(1, 2)), (x, torch.stack((y, y), 1)), (x[:, :1], y)
+    both = x[:, :1], torch.stack((y, y), 1)  # as many columns in all
+    for of_x, of_y in (*others, both):
+        for call in (tuned.fit, tuned.smooth, tuned.forecast):
+            with pytest.raises(
+                ValueError, match=r"was tuned for 1 .* of 2 .* and 1 output\(s\); got .*: call `tune`"
+            ):
+                call(of_x, of_y)
 
 
 def test_a_kernel_that_is_learned_elsewhere_is_taken_where_nobody_wants_a_gradient() -> None:

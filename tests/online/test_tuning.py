@@ -49,6 +49,11 @@ def test_each_coordinate_and_each_stream_has_its_own_width() -> None:
     x, y = (torch.stack([pair[k] for pair in along], 1) for k in range(2))
     found = st.StaFRegressor().tune(x, y).tuning
     assert found is not None
+    table = repr(found).splitlines()
+    assert table[0].startswith("Tuning of 2 stream(s), n = 2, 1 output(s)")
+    assert [line.split("  ")[0] for line in table[2:5]] == ["width of x[0]", "width of x[1]", "noise of y"]
+    assert len(table) == 8
+    assert bool((found.likelihood > found.untuned).all())
     assert float(found.spread[0, 1]) > 1.5 * float(found.spread[0, 0])
     assert float(found.spread[1, 0]) > 1.5 * float(found.spread[1, 1])
 
@@ -103,7 +108,6 @@ def test_a_mixture_has_nothing_to_tune() -> None:
     x, y = drawn(torch.tensor([0.7, 0.7]).double(), 0.1, steps=30)
     model = mixture()
     assert model.tune(x, y) is model
-    assert not model.__sklearn_is_fitted__()
     with pytest.raises(ValueError, match=r"tune.*must have the shape"):
         st.StaFRegressor().tune(x[:, 0], y)
 
@@ -197,6 +201,10 @@ def test_units_are_those_of_what_was_measured_of_each_coordinate() -> None:
         seen = x[:40, k][~x[:40, k].isnan()]
         assert float((center[k] - seen.mean()).abs()) < 1e-9 * float(center[k])
         assert float((spread[k] / seen.std(correction=0) - 1).abs()) < 1e-9
+    held, gaps = x.clone(), y.clone()
+    held[1:, 0], gaps[0] = torch.nan, torch.nan  # what is held was measured with a sample without target
+    plain = st.StaFRegressor().fit(held, gaps)
+    assert int(plain.n_skipped_) == int(st.StaFRegressor(scaling=True).fit(held, gaps).n_skipped_)
     never = st.StaFRegressor(scaling=True).fit(x.where(torch.tensor([True, False]), torch.nan), y)
     assert (
         int(never.n_samples_seen_) == 0

@@ -257,7 +257,7 @@ class MixtureRegressor(StreamEstimator):
         n_streams_: S, or None for a single stream without batch dimension.
         n_outputs_: K, or None for y without a dimension of its own.
         n_samples_seen_: samples that each stream has learned from, () or (S,).
-        n_skipped_: samples that were not learned, () or (S,).
+        n_skipped_: samples that were not learned, () or (S,). One that waits for the next is in neither.
     """
 
     def __init__(
@@ -270,14 +270,14 @@ class MixtureRegressor(StreamEstimator):
         self.scaling = scaling
 
     def tune(self, x: Any, y: Any) -> Self:
-        """Check the shapes and forget what was learned: a mixture has nothing to tune.
+        """Check the shapes and change nothing: a mixture has nothing to tune, and what was learned stays.
 
         Args:
             x: (T, n), one stream in time, or (T, S, n), S streams.
             y: x's shape without n, or with K in place of n for K outputs.
         """
         pair(self._call("tune"), x, y, (2, 3))
-        return self.reset()
+        return self
 
     def _begin(self, streams: int, outputs: int, like: Tensor) -> Bank:
         memory = integer(_NAME, "memory", self.memory, least=2 * RECENT)
