@@ -72,8 +72,7 @@ def pairs(size: int, lead: tuple[int, ...], dtype: torch.dtype) -> Iterator[tupl
             wanted = torch.linalg.solve_ex(a, right, **options)
             yield solution, wanted[0]
             yield info, wanted[1]
-            assert factor.isnan().all()
-            assert factor.shape == a.shape
+            assert torch.equal(factor, a)
             assert pivots.dtype == torch.int32
             assert bool((pivots == -1).all())
             assert pivots.shape == a.shape[:-1]

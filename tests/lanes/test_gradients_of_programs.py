@@ -217,15 +217,27 @@ def cut(x: Tensor, _: Tree, __: Tree) -> tuple[Tensor, Tensor]:
     )
 
 
-@pytest.mark.parametrize("step", [loops, cut])
-def test_loops_and_what_is_cut_have_the_gradients_of_the_definition(step: Callable[..., Any]) -> None:
+def solved(x: Tensor, _: Tree, __: Tree) -> tuple[Tensor, Tensor]:
+    """Solutions of a row's own equations and normed layers, whose derivatives torch keeps for itself."""
+    matrix = 3 * torch.eye(3, dtype=x.dtype) + (MATRIX.mT @ MATRIX) * x[:, :3].unsqueeze(-1)
+    found = torch.linalg.solve(matrix, x[:, 3:6].unsqueeze(-1)).squeeze(-1)
+    other = torch.linalg.solve(matrix.mT, x[:, 6:].view(-1, 2, 3), left=False).sum(-2)
+    normed = torch.nn.functional.layer_norm(x, (12,), LARGE[0])
+    return GAIN * x.sin() + 0.1 * normed, found * other
+
+
+@pytest.mark.parametrize("step", [loops, cut, solved])
+def test_loops_and_what_is_cut_have_the_gradients_of_the_definition(
+    step: Callable[..., Any], caplog: pytest.LogCaptureFixture
+) -> None:
     program, x = lanes.Program(step), drawn(5, 12).requires_grad_()
     with torch.no_grad():
         x[3] = math.nan
-    more = [GAIN, MATRIX, *([LARGE, FEW] if step is loops else [])]
+    more = [GAIN, MATRIX, *{loops: [LARGE, FEW], cut: [], solved: [LARGE]}[step]]
     given = x, (), ()
     found, wanted = (gradients(run, given, *more, steps=3) for run in (program, program.definition))
     for one, other in zip(found, wanted, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-10, atol=1e-12, equal_nan=True)
     x.data[3] = 0.0
     close(*(gradients(run, given, *more, steps=3) for run in (program, program.definition)), tolerance=1e-10)
+    assert "plain torch" not in caplog.text

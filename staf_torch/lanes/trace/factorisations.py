@@ -115,12 +115,12 @@ def solve(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """A^-1 B, by elimination with pivots of the largest size in a column: (..., M, M), (..., M, P).
 
-    B A^-1 where not ``left``, (..., P, M). The factor and the pivots that torch returns besides, for
-    derivatives alone, are not found: NaN and -1. The last is 0, or the place of a pivot that is 0.
+    B A^-1 where not ``left``, (..., P, M). In the place of the factor and the pivots that torch returns
+    besides, for derivatives alone, are A and -1. The last is 0, or the place of a pivot that is 0.
     """
     if not left:
-        solution, *rest = solve(matrix.mT, right.mT)
-        return solution.mT.clone(), rest[0], rest[1], rest[2]
+        solution, _, pivots, failed = solve(matrix.mT, right.mT)
+        return solution.mT.clone(), matrix.clone(), pivots, failed
     vector = right.dim() == 1 or right.shape == matrix.shape[:-1]  # as torch tells them apart
     columns = right.unsqueeze(-1) if vector else right
     size, width = matrix.shape[-1], columns.shape[-1]
@@ -147,10 +147,17 @@ def solve(
     # After as many passes the columns of B come first; row i holds the unknown of its pass.
     belongs = order.unsqueeze(-2) == place.unsqueeze(-1)
     solution = torch.where(belongs.unsqueeze(-1), whole[..., :width].unsqueeze(-3), 0.0).sum(-2)
-    factor, pivots = torch.full_like(matrix, torch.nan), torch.full_like(matrix[..., 0], -1).int()
+    pivots = torch.full_like(matrix[..., 0], -1).int()
     for _ in range(failed.dim() - matrix.dim() + 2):  # a matrix of several right sides
         failed = failed[0]
-    return solution.squeeze(-1) if vector else solution, factor, pivots, failed.int()
+    return solution.squeeze(-1) if vector else solution, matrix.clone(), pivots, failed.int()
+
+
+def solve_again(
+    matrix: Tensor, pivots: Tensor, right: Tensor, *, left: bool = True, adjoint: bool = False
+) -> Tensor:
+    """A^-1 B, or A'^-1 B, from what `solve` has returned in the place of a factor, in its derivative."""
+    return solve(matrix.mT if adjoint else matrix, right, left=left)[0]
 
 
 def orthogonal(matrix: Tensor, mode: str = "reduced") -> tuple[Tensor, Tensor]:

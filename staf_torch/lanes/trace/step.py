@@ -57,13 +57,15 @@ def lower(t: Tracer, func: Any, name: str, out: Any, args: Sequence[Any], kwargs
         return moved(t, func, out, args, kwargs)
     tables: Any = (CHOICES,) if rolled else (FACTORISATIONS, REPLACEMENTS)
     decomposition = next((table[name] for table in tables if name in table), decomposition_table.get(func))
+    if name == "linalg_lu_solve" and any(t.graph.value(node) != -1 for node in t.nodes(args[1]).flat):
+        decomposition = None  # the factors of somebody else
     if decomposition is None and func._can_decompose():  # of several operations, also in torch
         decomposition = func.decompose
     if decomposition is None:
         raise NotLoweredError(f"`{func}` has no scalar form here", plain)
     with t:
         result = decomposition(*args, **kwargs)
-    parts = [result] if isinstance(result, Tensor) else list(result)
+    parts = tensors(result)  # a slope that nobody wants is None
     nodes = [t.nodes(part) for part in parts]
     return nodes[0] if isinstance(result, Tensor) else nodes
 
@@ -254,6 +256,7 @@ FACTORISATIONS: dict[str, Callable[..., Any]] = {
     "cholesky_solve": factorisations.cholesky_solve,
     "linalg_inv_ex": factorisations.inverse,
     "_linalg_solve_ex": factorisations.solve,
+    "linalg_lu_solve": factorisations.solve_again,
     "linalg_qr": factorisations.orthogonal,
     "linalg_matrix_exp": matrix_exponential,
     "_linalg_eigh": eigenvalues.eigen,
