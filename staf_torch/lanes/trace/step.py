@@ -57,7 +57,9 @@ def lower(t: Tracer, func: Any, name: str, out: Any, args: Sequence[Any], kwargs
         return moved(t, func, out, args, kwargs)
     tables: Any = (CHOICES,) if rolled else (FACTORISATIONS, REPLACEMENTS)
     decomposition = next((table[name] for table in tables if name in table), decomposition_table.get(func))
-    if name == "linalg_lu_solve" and any(t.graph.value(node) != -1 for node in t.nodes(args[1]).flat):
+    if name == "linalg_lu_solve" and any(
+        t.graph.value(node) != -1 for node in t.nodes(args[1]).ravel().tolist()
+    ):
         decomposition = None  # the factors of somebody else
     if decomposition is None and func._can_decompose():  # of several operations, also in torch
         decomposition = func.decompose
