@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ..approximation.basis import StaFBasis, Target
 from ..lanes import Program, Shared
+from ..lanes.device.chunks import joined
 from ..lanes.opaque import opaque
 from ..lanes.row_numbers import over_rows
 from ..lanes.tree import plain
@@ -175,8 +176,8 @@ def chase_weights(
     if one:
         remember(key, run.program, problem, piece, everything=False, history=bool(history))
     if history:
-        joined = recorded[0] if len(recorded) == 1 else torch.cat(recorded, dim=1)
-        return ChaseWeights(joined, run.carry.diverged_at)
+        found = joined(recorded)
+        return ChaseWeights(found, run.carry.diverged_at.to(found.device))
     return ChaseWeights(last_weights(run.carry).unsqueeze(1), run.carry.diverged_at)
 
 

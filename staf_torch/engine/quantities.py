@@ -114,8 +114,10 @@ class Numbers(NamedTuple):
     def result(
         self, state: Tensor, diverged_at: Tensor, certificate: Certificate | None = None
     ) -> ChaseResult:
-        """Return them as a result."""
-        return ChaseResult(state=state, diverged_at=diverged_at, certificate=certificate, **self._asdict())
+        """Return them as a result, all where they are."""
+        where = self.weights.device  # the processor, where a history has no room on the states' device
+        parts = {"state": state.to(where), "diverged_at": diverged_at.to(where)}
+        return ChaseResult(**parts, certificate=certificate, **self._asdict())
 
 
 def numbers(

@@ -87,7 +87,8 @@ class Repeated:
         chase = self._end.chase
         diverged_at = rooms[chase.diverged_at]
         if self._history:
-            return ChaseWeights(rooms[self._outputs.weights], diverged_at)
+            weights = rooms[self._outputs.weights]
+            return ChaseWeights(weights, diverged_at.to(weights.device))
         carry = chase._replace(weights=rooms[chase.weights], log_gain=rooms[chase.log_gain])
         return ChaseWeights(last_weights(carry).unsqueeze(1), diverged_at)
 

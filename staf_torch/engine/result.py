@@ -5,9 +5,9 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable
 
-import torch
 from torch import Tensor
 
+from ..lanes.device.chunks import joined
 from ..numerics.shown import span
 from .certificate import Certificate
 
@@ -91,16 +91,16 @@ def concatenate(pieces: Iterable[ChaseResult]) -> ChaseResult:
     parts = list(pieces)
     if len(parts) == 1:
         return parts[0]
-    joined = {
-        field.name: torch.cat([getattr(part, field.name) for part in parts], dim=1)
+    whole = {
+        field.name: joined([getattr(part, field.name) for part in parts])
         for field in dataclasses.fields(ChaseResult)
         if field.name not in ("diverged_at", "certificate")
     }
     vouched = [part.certificate for part in parts if part.certificate is not None]
     return ChaseResult(
-        **joined,
-        diverged_at=parts[-1].diverged_at,
-        certificate=Certificate(*(torch.cat(terms, dim=1) for terms in zip(*vouched, strict=True)))
+        **whole,
+        diverged_at=parts[-1].diverged_at.to(whole["weights"].device),
+        certificate=Certificate(*(joined(terms) for terms in zip(*vouched, strict=True)))
         if vouched
         else None,
     )

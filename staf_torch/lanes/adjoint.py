@@ -203,7 +203,7 @@ class GradientCall:
             if isinstance(where, bool):
                 plan = PlannedCall(alone, leaves, timed, **sizes, every=every, backwards=back, rooms=rooms)
             else:
-                plan = DeviceCall(alone, leaves, timed, **sizes, every=every, once=0, where=where)
+                plan = DeviceCall(alone, leaves, timed, **sizes, every=every, once=0, where=where, whole=True)
             self._plans[key] = built.compiled, plan
         if rooms and isinstance(plan, PlannedCall):
             plan.into(rooms, leaves)

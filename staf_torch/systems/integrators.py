@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ..lanes import Program, repeat
+from ..lanes.device.chunks import rows_of, with_rows
 from ..lanes.device.host import capturing
 from ..lanes.gradients import wants_gradient
 from ..lanes.loop_program import LoopProgram
@@ -92,9 +93,9 @@ def trajectory(
             yield piece
             continue
         if bool(bent.isnan().all()):  # by plain torch, which takes as long for all states at once as for one
-            some = torch.arange(len(x0), device=x0.device).split(max(1, _TOGETHER // piece.shape[1]))
-            bent = torch.cat([_advanced_rows(system, k, piece[k], dt, 1)[1].amax(1) for k in some])
-            reach = piece.abs().amax(-1).amax(1)
+            some = torch.arange(len(x0), device=x.device).split(max(1, _TOGETHER // piece.shape[1]))
+            bent = torch.cat([_advanced_rows(system, k, rows_of(piece, k), dt, 1)[1].amax(1) for k in some])
+            reach = piece.abs().amax(-1).amax(1).to(x.device)
         strained = ~(bent <= BENT * reach) & torch.isfinite(reach)
         if bool(strained.any()):
             after, piece = _refined(system, dt, x, after, piece, strained.nonzero().squeeze(1))
@@ -174,7 +175,7 @@ def _refined(
     system: ControlAffineSystem, dt: float, x: Tensor, after: Tensor, piece: Tensor, rows: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return the end and the states of a piece in which these rows (R,) took the steps that they need."""
-    states = piece[rows]
+    states = rows_of(piece, rows)
     bent = _advanced_rows(system, rows, states, dt, 1)[1].nan_to_num(math.inf, math.inf)
     bent = torch.where(torch.isfinite(states).all(-1), bent, -1.0)
     at = bent.topk(min(TRIED, bent.shape[1]), dim=1).indices.unsqueeze(-1)
@@ -196,7 +197,7 @@ def _refined(
             times = piece.shape[1]
             with some_rows(chosen):
                 (end, _, _), again = _stepped(system, dt, factor, times, begun[0])(begun, steps=times)
-            after, piece = after.index_copy(0, chosen, end), piece.index_copy(0, chosen, again)
+            after, piece = after.index_copy(0, chosen, end), with_rows(piece, chosen, again)
     wrong = found.error > GRACE * TOLERANCE
     if bool(wrong.any()):
         _log.warning(
@@ -213,6 +214,8 @@ def _refined(
 @beside
 def simulate(system: ControlAffineSystem, x0: Tensor, *, dt: float, steps: int) -> Tensor:
     """The whole of `trajectory` at once: (B, n) -> (B, steps + 1, n).
+
+    Where a device has no room for the states they are on the processor, and the log has a line.
 
     Example:
         >>> x0 = torch.tensor([[1.0, 0.0], [0.5, 0.0]]).double()  # (B, n)

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ...lanes import Program
+from ...lanes.device.chunks import joined, rows_of, with_rows
 from ...lanes.gradients import wants_gradient
 from ...lanes.loop_program import LoopProgram
 from ...lanes.opaque import opaque
@@ -182,7 +183,7 @@ class _LoopRun:
             result, last = self.of(loop, ready.program)
         with torch.no_grad():
             seen = result.state[:, :: max(1, result.state.shape[1] // _SEEN)]
-            reach = wrap(seen, loop.system.periodic).abs().amax(-1).amax(-1)
+            reach = wrap(seen, loop.system.periodic).abs().amax(-1).amax(-1).to(last.bent.device)
             strained = ~(last.bent <= BENT * reach) & torch.isfinite(reach)
             if loop.euler:
                 strained[:_EULER] = True
@@ -220,8 +221,9 @@ class _LoopRun:
         ``again``; warn of those that are wrong by more than a little."""
         at = rows.nonzero().squeeze(1)
         with torch.no_grad(), some_rows(at):
-            frozen = result.diverged[at]
-            rest, states, controls = loop.system.resting_input(), result.state[at], result.control[at]
+            frozen = rows_of(result.diverged, at)
+            rest = loop.system.resting_input()
+            states, controls = rows_of(result.state, at), rows_of(result.control, at)
             moves = hardest(loop.holding, states, controls, rest, frozen)
             found = needed(loop.holding, *moves, frozen)
         warn_of_models(loop.controller, *moves)
@@ -255,7 +257,7 @@ class _LoopRun:
         kept, structure = flatten([getattr(result, name) for name in OF_ROWS])
         new = flatten([getattr(other, name) for name in OF_ROWS])[0]
         pairs = zip(kept, new, strict=True)
-        mixed = [old.index_copy(0, rows, fresh if alone else fresh[rows]) for old, fresh in pairs]
+        mixed = [with_rows(old, rows, fresh if alone else rows_of(fresh, rows)) for old, fresh in pairs]
         return LoopResult(result.time, *unflatten(structure, iter(mixed)))
 
 
@@ -286,11 +288,14 @@ def _run(
             pieces.append(flatten(out)[0])
         done += count
         progress(count)
-    last, structure = flatten(record(loop, state, torch.full_like(pieces[-1][1][:, -1], torch.nan)))
+    none = torch.full_like(pieces[-1][1][:, -1], torch.nan, device=x0.device)
+    last, structure = flatten(record(loop, state, none))
     pieces.append([part.unsqueeze(1) for part in last])
-    kept = unflatten(structure, (torch.cat(column, dim=1) for column in zip(*pieces, strict=True)))
+    columns = [joined(column) for column in zip(*pieces, strict=True)]
+    where = next((column.device for column in columns if column.device != x0.device), x0.device)
+    kept = unflatten(structure, (column.to(where) for column in columns))
     time = torch.arange(0, steps + 1, every, dtype=torch.float64, device="cpu") * loop.dt
-    frozen_at = torch.where(state.alive, torch.inf, state.lived * loop.dt)
+    frozen_at = torch.where(state.alive, torch.inf, state.lived * loop.dt).to(where)
     result = LoopResult(time, kept.x, kept.u, kept.cost, kept.recorded, frozen_at, state.carried)
     return result, state
 

@@ -50,6 +50,7 @@ class CudaDevice:
         properties = torch.cuda.get_device_properties(index)
         self._few = _FEW * _WARP * int(properties.multi_processor_count)
         self.architecture = 10 * int(properties.major) + int(properties.minor)
+        self._memory = int(properties.total_memory)
         self._kernels: dict[str, ctypes.c_void_p] = {}
         self._launch = _driver().cuLaunchKernel
         self._stream = torch._C._cuda_getCurrentRawStream
@@ -82,6 +83,15 @@ class CudaDevice:
         _checked(driver.cuDeviceGet(ctypes.byref(number), self.index))
         _checked(driver.cuDevicePrimaryCtxRetain(ctypes.byref(context), number))
         _checked(driver.cuCtxSetCurrent(context))
+
+    def memory(self) -> int:
+        """Return the bytes of all its memory."""
+        return self._memory
+
+    def free(self) -> int:
+        """Return the bytes that are free, those that torch keeps for itself among them."""
+        kept = torch.cuda.memory_reserved(self.index) - torch.cuda.memory_allocated(self.index)
+        return int(torch.cuda.mem_get_info(self.index)[0]) + kept
 
     def attributes(self, text: str) -> dict[str, int]:
         """Return the registers of a thread and the bytes of memory of its own, of a kernel."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -44,7 +45,7 @@ _lock = Mutex()
 
 
 @contextlib.contextmanager
-def host() -> Iterator[None]:
+def host(memory: int = sys.maxsize) -> Iterator[None]:
     """Context: programs take the processor's tensors for those of a device, and run kernels built by g++.
 
     Example:
@@ -56,12 +57,16 @@ def host() -> Iterator[None]:
         Shown by `staf_torch/lanes/DEVICE.md`.
 
     Of the whole process; what is tested is the way to a CUDA device without one.
+
+    Args:
+        memory: bytes that the results of a call may take at once.
     """
-    before, call.processor = call.processor, torch.device("cpu")
+    global _memory
+    before, call.processor, _memory = (call.processor, _memory), torch.device("cpu"), memory
     try:
         yield
     finally:
-        call.processor = before
+        call.processor, _memory = before
 
 
 @contextlib.contextmanager
@@ -124,6 +129,7 @@ def capturing(x: Tensor) -> bool:
 
 _taken: list[str] | None = None
 _launches: list[Callable[[], None]] | None = None
+_memory = sys.maxsize
 
 
 class HostDevice:
@@ -159,3 +165,11 @@ class HostDevice:
             copy = ctypes.create_string_buffer(arguments.raw, len(arguments))
             _launches.append(lambda: kernel(ctypes.addressof(copy), *sizes))
         kernel(ctypes.addressof(arguments), *sizes)
+
+    def memory(self) -> int:
+        """Return the bytes that results of a call may take."""
+        return _memory
+
+    def free(self) -> int:
+        """Return the same: what is computed with is not counted."""
+        return _memory

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import functools
-import math
 import struct
 from collections.abc import Collection, Sequence
 from typing import Any, Protocol
@@ -17,6 +16,7 @@ from ..emit.cuda import in_arguments
 from ..locks import Mutex
 from ..row_numbers import columns
 from ..tree import Shared, plain
+from .chunks import Room, in_chunks
 from .cuda import CudaDevice
 from .host import HostDevice, capturing
 
@@ -31,6 +31,12 @@ class Device(Protocol):
 
     def launch(self, kernel: Any, arguments: ctypes.Array[ctypes.c_char], rows: int) -> None:
         """Start a kernel for so many rows, with this structure."""
+
+    def memory(self) -> int:
+        """Return the bytes of all its memory."""
+
+    def free(self) -> int:
+        """Return the bytes that are free."""
 
 
 @functools.cache
@@ -66,6 +72,7 @@ class DeviceCall:
         rows, steps, every: of the call.
         once: how many of the leaves a row has once.
         where: the device.
+        whole: whether results must be there; else what does not fit comes to the processor (`in_chunks`).
 
     Attributes:
         structure: of the outputs.
@@ -87,7 +94,9 @@ class DeviceCall:
         every: int,
         once: int,
         where: torch.device,
+        whole: bool = False,
     ) -> None:
+        self._steps, self._every, self._timed, self._whole = steps, every, times, whole
         self._compiled, self.structure, self._rows, self._once = compiled, compiled.structure, rows, once
         self._where = where
         leaves = self._with_columns(leaves)
@@ -96,17 +105,18 @@ class DeviceCall:
         read = [self._input(k, *given) for k, given in enumerate(zip(leaves, times, strict=True))]
         self.direct = not self._copied and not any(type(leaf) is Shared for leaf in leaves)
         recorded = -(-steps // every)
-        self._rooms: list[Any] = [
-            ((rows, *s), (1, *inner_strides(s, rows)), dtype) for s, dtype in compiled.carry
+        self._rooms: list[Room | None] = [
+            Room((rows, *s), (1, *inner_strides(s, rows)), dtype) for s, dtype in compiled.carry
         ]
         for s, dtype in compiled.outputs:
             strides = 1, s.numel() * rows, *inner_strides(s, rows)
-            self._rooms.append(((rows, recorded, *s), strides, dtype))
+            self._rooms.append(Room((rows, recorded, *s), strides, dtype))
         most = max([s.numel() for s, _ in (*compiled.carry, *compiled.outputs)], default=1)
         reach = max([abs(entry) * entries for *_, entry, entries in read], default=0)
         wide = max(rows * (recorded + 1) * most, reach) > _MOST
         unit = all(entry == 1 or entries == 1 for *_, entry, entries in read)
-        self._device = device(where)
+        self._device, self._all = device(where), [room for room in self._rooms if room is not None]
+        self._bytes = sum(room.bytes for room in self._rooms if room is not None)
         self.text = kernel_text(compiled.call, unit=unit, wide=wide)
         self._kernel = self._device.compile(self.text)
         self._arguments(read, rows, steps, every)
@@ -146,8 +156,10 @@ class DeviceCall:
             leaves: inputs of the forms that the examples had.
 
         Raises:
-            RuntimeError: of the kind that torch raises, if there is no memory for them.
+            torch.OutOfMemoryError: if there is no memory for them, neither there nor on the processor.
         """
+        if self._bytes > self._device.memory():
+            return self._in_chunks(leaves)
         given = [leaf.tensor if type(leaf) is Shared else leaf for leaf in self._with_columns(leaves)]
         for k in self._copied:
             given[k] = given[k].to(self._where).contiguous()
@@ -160,7 +172,9 @@ class DeviceCall:
         except RuntimeError as error:  # of an earlier kernel, too, which is told as it is
             if not isinstance(error, torch.OutOfMemoryError) and "allocate memory" not in str(error):
                 raise
-            raise type(error)(self._too_large()) from error
+            rooms = []
+        if not rooms and self._rooms:
+            return self._in_chunks(leaves)
         addresses = [0 if room is None else room.data_ptr() for room in rooms]
         with self._lock:  # the driver copies the structure when it is called
             self._pack(self._record, 0, *map(_address, given), *addresses)
@@ -169,21 +183,46 @@ class DeviceCall:
             _of_graphs[self._table.data_ptr()] = self._table
         return rooms
 
+    def _in_chunks(self, leaves: Sequence[Any]) -> list[Tensor]:
+        """Run in chunks of times, the outputs on the processor.
+
+        Raises:
+            torch.OutOfMemoryError: if that cannot be.
+        """
+        made: dict[Any, DeviceCall] = {}
+        sizes: dict[str, Any] = {"rows": self._rows, "every": self._every, "once": self._once}
+
+        def some(given: Sequence[Any], steps: int) -> list[Tensor]:
+            form = steps, *(plain(leaf).stride() for leaf in given)
+            if form not in made:
+                sizes.update(steps=steps, where=self._where, whole=True)
+                made[form] = DeviceCall(self._compiled, given, self._timed, **sizes)
+            return made[form](given)
+
+        found = None
+        if not (self._whole or capturing(self._compiled.table.new_empty(0, device=self._where))):
+            more: dict[str, Any] = {"free": self._device.free(), "where": self._where}
+            more |= {"carries": len(self._compiled.carry), "steps": self._steps, "every": self._every}
+            found = in_chunks(some, leaves, self._timed, self._all, **more)
+        if found is None:
+            raise torch.OutOfMemoryError(self._too_large())
+        return found
+
     def _too_large(self) -> str:
         """What to do where results find no room."""
-        some = [room for room in self._rooms if room is not None]
-        size = sum(math.prod(shape) * dtype.itemsize for shape, _, dtype in some)
-        times = max((shape[1] for shape, *_ in self._rooms[len(self._compiled.carry) :] if shape), default=0)
+        times = -(-self._steps // self._every)
         return (
-            f"The results of this call take {size / 1e9:.3g} GB on {self._where}, for {self._rows} rows and "
-            f"{times} recorded times; there is no room for them. Record fewer times (`every=`), leave the "
-            "history out (`history=False`) where that is offered, or call for fewer rows or times in turn."
+            f"The results of this call take {self._bytes / 1e9:.3g} GB on {self._where}, for {self._rows} "
+            f"rows and {times} recorded times; there is no room for them, nor in the processor's memory. "
+            "Record fewer times (`every=`), leave the history out (`history=False`) where that is "
+            "offered, or call for fewer rows or times in turn."
         )
 
     def leave_out(self, ends: Collection[int]) -> None:
         """Write nothing of these of the carry: None is in their place from now on."""
         for k in ends:
             self._rooms[k] = None
+        self._bytes = sum(room.bytes for room in self._rooms if room is not None)
 
     def _with_columns(self, leaves: Sequence[Any]) -> Sequence[Any]:
         if not self._compiled.rows:
