@@ -143,7 +143,7 @@ def test_a_program_of_a_users_own_takes_columns_and_other_numbers_need_no_compil
         torch.testing.assert_close(alone[0], x[0], rtol=0, atol=0, equal_nan=True)
         gain.fill_(0.0)
         torch.testing.assert_close(made(x0, u)[0], made.definition(x0, u)[0])
-    with pytest.raises(ValueError, match=r"a batch of 3 rows met numbers of `rows\(\.\.\.\)` for 100"):
+    with pytest.raises(ValueError, match=r"a batch of 3 rows met `rows\(\.\.\.\)` of 100"):
         made(x0[:3], u[:3])
 
 
@@ -291,7 +291,7 @@ def test_near_optimal_of_rows_that_look_ahead_differently_far_is_that_of_single_
     assert many(x0.float()).dtype == torch.float32
     spoilt = torch.cat((x0[:1] + torch.nan, x0[1:]))
     assert torch.equal(many(spoilt)[1:], found[1:])
-    with pytest.raises(ValueError, match=r"a batch of 3 rows met numbers of `rows\(\.\.\.\)` for 4"):
+    with pytest.raises(ValueError, match=r"a batch of 3 rows met `rows\(\.\.\.\)` of 4"):
         many(x0[:3])
     with pytest.raises(ValueError, match=r"`NearOptimal.report\(plant=...\)` must have no numbers of a row"):
         many.report()
@@ -327,7 +327,7 @@ def test_a_row_without_an_optimum_spoils_no_other_and_says_why() -> None:
     spoilt = shooting.solve(x0)
     assert spoilt.reason[0].startswith("the cost is not finite")
     assert torch.equal(spoilt.value[1:], found.value[1:])
-    with pytest.raises(ValueError, match=r"a batch of 4 rows met numbers of `rows\(\.\.\.\)` for 3"):
+    with pytest.raises(ValueError, match=r"a batch of 4 rows met `rows\(\.\.\.\)` of 3"):
         shooting.solve(starts(4))
 
 
@@ -394,7 +394,7 @@ def test_streams_with_a_width_and_a_noise_of_their_own_are_streams_alone(scaling
         alone.partial_fit(x[1:2], y[1:2])
     for found, wanted in zip(many.predict(x, True), alone.predict(x[1:2], True), strict=True):
         torch.testing.assert_close(found[1:2], wanted, rtol=1e-9, atol=1e-9)
-    with pytest.raises(ValueError, match=r"a batch of 2 rows met numbers of `rows\(\.\.\.\)` for 3"):
+    with pytest.raises(ValueError, match=r"a batch of 2 rows met `rows\(\.\.\.\)` of 3"):
         st.StaFRegressor(radius=st.rows(spread(0.3, 0.6))).partial_fit(x[:2], y[:2])
 
 

@@ -167,7 +167,9 @@ def _local(
     plant, cost, low, high, radius = given
     period = held_period("near_optimal", plant, dt)
     check_still("near_optimal", "plant", plant, "`RecedingHorizon` or `LQR`")
-    check_endless("near_optimal", "cost", cost.ending, "the policy knows no end; plans do, `RecedingHorizon`")
+    check_endless(
+        "near_optimal", "cost", cost.ending, "the policy has no final time; plans have one: `RecedingHorizon`"
+    )
     placed = regulated("near_optimal", plant, cost.bounded(low, high))
     lqr = LQR(plant, placed, period=period)
     decay = slowest(lqr, plant, placed, period)

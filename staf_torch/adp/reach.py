@@ -120,8 +120,8 @@ def looked(policy: SampledRollout, lqr: LQR, box: Tensor, settles: Tensor, way: 
     kept = share if is_of_rows(share) else float(share)
     if way == "auto" and not base.known:
         _log.warning(
-            "near_optimal did not look how far the LQR leads: to follow it from %d states of the box %s "
-            "takes longer than 0.4 s (%.0f %% had arrived by then). `report()` looks.",
+            "near_optimal did not check from where the LQR regulates: its simulation from %d states of the "
+            "box %s takes longer than 0.4 s (%.0f %% had arrived by then). `report()` checks.",
             *(len(x0), _shown(box), 100 * float(of_first(share))),
         )
         note = "the simulation of the LQR was stopped after 0.4 s"
@@ -166,7 +166,7 @@ def extended(
         if way == "global":
             raise fail("near_optimal", "reach", f"must be local here: {error}", way) from error
         _log.warning(
-            "near_optimal: the LQR regulates %.0f %% of %d states of the box %s, and its rollouts promise no "
+            "near_optimal: the LQR regulates %.0f %% of %d states of the box %s, and its rollouts no "
             "more. There is no global value: %s",
             *(100 * share, len(x0), _shown(box), error),
         )

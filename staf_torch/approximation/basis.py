@@ -248,7 +248,7 @@ class StaFBasis(nn.Module, metaclass=Rowwise):
                 raise
             raise ValueError(
                 f"The target must take points of {centers.dtype}, in which this basis computes: convert one "
-                f"of them by `.double()` or `.float()`; torch says: {error}"
+                f"of them by `.double()` or `.float()`; torch's error: {error}"
             ) from error
         values = sampled(target, found, centers, outputs)
         return values if outputs is None else values.movedim(-1, 0)

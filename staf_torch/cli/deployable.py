@@ -268,7 +268,7 @@ def _controller(
         _replayed(problem, history, precise, row)
         controller = without_plans(controller)
     elif function:
-        rule = "must be left away: what this run's controller does is a function of x, or it learns"
+        rule = "must be omitted: what this run's controller does is a function of x, or it learns"
         raise fail("staf-export", "function", rule, controller.label)
     else:
         last = policy_of(controller, weights[-2] if learns else None)
@@ -338,7 +338,7 @@ def _learner(cfg: DictConfig, history: dict[str, Tensor], precise: bool, row: in
     learns = learner(problem.controller) is not None
     if not learns and isinstance(innermost(problem.controller), Feedback):
         what = type(problem.controller).__name__
-        raise fail("staf-export", "learning", "must be left away where nothing learns", what)
+        raise fail("staf-export", "learning", "must be omitted where nothing learns", what)
     found, steps = _replayed(problem, history, precise, row)
     x0, seed = problem.initial_states[row : row + 1], problem.seed + row
     draws = problem.controller.draws

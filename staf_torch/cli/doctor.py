@@ -39,7 +39,7 @@ def main(words: Sequence[str] = ()) -> int:
         ValueError: if there are words: it takes none.
     """
     if words:
-        raise ValueError(f"`staf doctor` takes nothing; got {words[0]!r}.")
+        raise ValueError(f"`staf doctor` takes no arguments; got {words[0]!r}.")
     sound = True
     for name, found, good in _findings():
         sys.stdout.write(f"{name + ':':<12}{found}{'' if good else '   <- problem'}\n")

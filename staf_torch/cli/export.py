@@ -61,7 +61,7 @@ def export(
         dtype: float64 or float32.
         output: of the file; RUN/export/<kind> and an ending by default.
         row: the trajectory.
-        batch: rows of every call; any by default.
+        batch: fixed number of rows of a call; any by default.
         calls: that the latency is the worst of.
         trust: as in `deployable`.
         name: of the C function or the graph; that of the run's folder by default.
@@ -272,23 +272,31 @@ def parser() -> argparse.ArgumentParser:
         description="Write a run's controller (adp) or approximation (gradient_chase) for a device, with a "
         "sheet of parameters, flops, latency and errors beside it.",
     )
-    found.add_argument("run", type=Path, help="run directory")
-    found.add_argument("--to", required=True, choices=tuple(ENDINGS), help="the format")
-    found.add_argument("--dtype", default="float64", choices=tuple(DTYPES))
-    found.add_argument("--output", type=Path, help="file; RUN/export/... by default")
-    found.add_argument("--row", type=int, default=0, help="trajectory (0)")
-    found.add_argument("--batch", type=int, help="rows of every call; any by default")
-    found.add_argument("--calls", type=int, default=sheet.CALLS, help=f"timed ({sheet.CALLS})")
+    found.add_argument("run", type=Path, help="directory of the run")
+    found.add_argument("--to", required=True, choices=tuple(ENDINGS), help="format of the file")
+    found.add_argument("--dtype", default="float64", choices=tuple(DTYPES), help="precision (float64)")
+    found.add_argument("--output", type=Path, help="file to write (RUN/export/...)")
+    found.add_argument("--row", type=int, default=0, help="trajectory of the run, from 0 on (0)")
+    found.add_argument("--batch", type=int, help="fixed number of rows of a call (any)")
     found.add_argument(
-        "--learning", action="store_true", help="with --to c: the controller goes on learning, from time 0"
+        "--calls", type=int, default=sheet.CALLS, help=f"calls timed for the sheet ({sheet.CALLS})"
     )
-    found.add_argument("--name", help="of the C function or the graph; the run's folder by default")
+    found.add_argument(
+        "--learning",
+        action="store_true",
+        help="with --to c: export a controller that goes on learning, from time 0",
+    )
+    found.add_argument("--name", help="name of the C function or the graph (that of the run's folder)")
     found.add_argument(
         "--function",
         action="store_true",
-        help="of near_optimal with bounds: its function of x, without plans",
+        help="of near_optimal with bounds: export u(x), without the plans of its controller()",
     )
-    found.add_argument("--trust", action="store_true", help="import code of your own that the settings name")
+    found.add_argument(
+        "--trust",
+        action="store_true",
+        help="import the modules that the run's settings name: code of whoever wrote them runs",
+    )
     return found
 
 

@@ -95,29 +95,33 @@ def _parser() -> argparse.ArgumentParser:
     kinds = (*_READ, *_PLAIN, "parquet")
     parser.add_argument("--format", choices=kinds, default="md", help="md (default), csv, tex, json, parquet")
     lists = {
-        "rows": "settings that tell rows apart (all that were swept)",
-        "columns": "settings over whose values a metric is spread",
+        "rows": "settings with a column of their own, a row for each combination (all that were swept)",
+        "columns": "settings whose values become columns of each metric",
         "metric": "metrics (md, tex: the headlines; else all)",
-        "aggregate": f"of {', '.join(AGGREGATES)}; n and failed, the numbers of runs, come with them",
-        "sort": "columns, each maybe with :desc for the largest first",
+        "aggregate": f"of {', '.join(AGGREGATES)}, over the runs of a row; n and failed count them",
+        "sort": "columns to sort by, smallest first; NAME:desc for the largest first",
     }
     for name, text in lists.items():
         parser.add_argument(f"--{name}", help=text, type=_names, default=(), metavar="NAME,...")
-    parser.add_argument("--best", choices=("bold",), help="the best number of each column (md, tex)")
-    parser.add_argument("--split", metavar="SETTING", help="a table for each of its values (md, tex)")
     parser.add_argument(
-        "--caption", metavar="TEXT", help="of a `table` environment; meanings follow it (tex)"
+        "--best", choices=("bold",), help="print the best number of each column in bold (md, tex)"
     )
-    parser.add_argument("--label", metavar="TEXT", help="for \\ref, with a caption (tex)")
+    parser.add_argument("--split", metavar="SETTING", help="a table for each value of this setting (md, tex)")
     parser.add_argument(
-        "--wide", action="store_true", help="over both columns of a page, with a caption (tex)"
+        "--caption",
+        metavar="TEXT",
+        help="put a `table` environment with this caption around it; meanings of the columns follow (tex)",
+    )
+    parser.add_argument("--label", metavar="TEXT", help="label for \\ref; needs --caption (tex)")
+    parser.add_argument(
+        "--wide", action="store_true", help="`table*`, over both columns of a page; needs --caption (tex)"
     )
     parser.add_argument(
         "--rename",
         type=_pairs,
         default={},
         metavar="NAME=TEXT,...",
-        help="write settings, metrics or texts in cells otherwise; TEXT is LaTeX (tex)",
+        help="names of settings, metrics or texts of cells in the printed table; TEXT is LaTeX (tex)",
     )
     parser.add_argument("--digits", type=int, default=3, help="significant digits of md and tex (3)")
     parser.add_argument(
@@ -126,9 +130,9 @@ def _parser() -> argparse.ArgumentParser:
         nargs="?",
         const=2.0,
         metavar="SECONDS",
-        help="print again every 2 seconds, or so many, until the sweep has ended",
+        help="print again every SECONDS (2) until the sweep has ended",
     )
-    parser.add_argument("--output", type=Path, metavar="FILE", help="write there, not to the terminal")
+    parser.add_argument("--output", type=Path, metavar="FILE", help="file to write in place of the terminal")
     return parser
 
 

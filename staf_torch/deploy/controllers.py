@@ -292,7 +292,9 @@ def check_bounded(call: str, controller: Controller) -> None:
         )
         raise fail(call, "controller", rule, f"iterations={controller.iterations}")
     if isinstance(controller, PlanReplay):
-        rule = "must be a feedback: a plan of direct shooting knows no state; `RecedingHorizon` follows one"
+        rule = (
+            "must be a feedback: a plan of direct shooting is no function of x; `RecedingHorizon` follows it"
+        )
         raise fail(call, "controller", rule, "PlanReplay")
 
 

@@ -91,7 +91,7 @@ def export_onnx(
         inputs: the name of its input, a list of one.
         outputs: the names of its outputs.
         example: of a module: an input, (B, n), in its dtype.
-        batch: of a module: rows of every call; any by default.
+        batch: of a module: fixed number of rows of a call; any by default.
         name: of the graph; that of the policy by default.
 
     Returns:

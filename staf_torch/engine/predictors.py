@@ -245,7 +245,7 @@ def along(function: Callable[[Tensor], Any], x: Tensor, dx: Tensor) -> tuple[Any
     except NotImplementedError as error:
         said = str(error).partition("\n")[0]
         raise NotImplementedError(
-            "A `Tangent` predictor needs derivatives of V and of the kernel in forward mode; torch says: "
+            "A `Tangent` predictor needs derivatives of V and of the kernel in forward mode; torch's error: "
             + said
         ) from None
     return primal, tangent

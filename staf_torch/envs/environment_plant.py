@@ -49,7 +49,7 @@ class EnvironmentPlant(StepPlant):
         high: likewise.
 
     Raises:
-        ValueError: if the actions are no Box, the environment cannot be put into a state or does not say its
+        ValueError: if the actions are no Box, the environment cannot be put into a state or does not have its
             ``dt``, or as in `StepPlant`.
     """
 
@@ -78,7 +78,7 @@ class EnvironmentPlant(StepPlant):
             read, write = _access(inside, env)
         period = getattr(inside, "dt", None) if dt is None else dt
         if period is None:
-            raise fail("EnvironmentPlant", "dt", "must be given: the environment does not say it", None)
+            raise fail("EnvironmentPlant", "dt", "must be given, in s: the environment has no `dt`", None)
         self.env = made
         unbounded = low is None and high is None
         super().__init__(

@@ -230,7 +230,7 @@ def bounds(cfg: DictConfig, progress: Progress = SHOWN) -> Bounds:
     problem = chase_problem(cfg)
     kernel = problem.basis.kernel
     if not isinstance(kernel, ExponentialKernel):
-        raise fail(COMMAND_LINE, "kernel", "must be exponential: the theorem is about no other", kernel)
+        raise fail(COMMAND_LINE, "kernel", "must be exponential: the theorem holds for no other", kernel)
     dim = problem.initial_states.shape[-1]
     settings = cfg.exponential_bound
     extent = positive_real(COMMAND_LINE, f"{name}.domain", settings.domain)

@@ -81,7 +81,9 @@ def adjoint_step(
             with Substituted(others) as substituted:
                 after, out = step(*trees)
             if substituted.unmet:
-                raise NotLoweredError("a tensor that requires a gradient is read where nobody sees it")
+                raise NotLoweredError(
+                    "the step reads a tensor that requires a gradient in a way that a trace does not record"
+                )
             made = *flatten(after)[0], *flatten(out)[0]
             chosen = zip(made, (*wanted.carry, *wanted.outputs), strict=True)
             return tuple(leaf for leaf, one in chosen if one)

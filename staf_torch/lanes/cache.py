@@ -171,20 +171,20 @@ class _TraceReader(pickle.Unpickler):
             there = getattr(there, part, None)
         if module.partition(".")[0] == _FOLDER.name and isinstance(there, type) and issubclass(there, tuple):
             return there  # named tuples, which structures of outputs are
-        raise pickle.UnpicklingError(f"{module}.{name} does not belong into a trace")
+        raise pickle.UnpicklingError(f"{module}.{name} is not allowed in a cached trace")
 
     def persistent_load(self, name: Any) -> Any:
         kind, value = name[0], name[1]
         if kind == "operation":
             namespace, _, operation = value.partition("::")
             if namespace not in _NAMESPACES:
-                raise pickle.UnpicklingError(f"operations of {namespace} do not belong into a trace")
+                raise pickle.UnpicklingError(f"operations of {namespace} are not allowed in a cached trace")
             packet = getattr(getattr(torch.ops, namespace), operation)
             return getattr(packet, name[2] or "default")
         if kind == "named":
             there = getattr(torch, value, None)
             if not isinstance(there, _NAMED):
-                raise pickle.UnpicklingError(f"torch.{value} does not belong into a trace")
+                raise pickle.UnpicklingError(f"torch.{value} is not allowed in a cached trace")
             return there
         if kind == "given":
             return self._given[value]

@@ -140,7 +140,7 @@ def say_transformed(name: str) -> None:
     if transformed() and not torch._C._len_torch_dispatch_stack():
         say(
             name,
-            "a transform of `torch.func` (vmap, jacrev, grad, ...) or forward mode looks at what it does",
+            "a transform of `torch.func` (vmap, jacrev, grad, ...) or forward mode is active",
         )
 
 

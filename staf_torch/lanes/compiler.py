@@ -103,7 +103,9 @@ def library(name: str, text: str, options: tuple[str, ...], folder: Path) -> Pat
         for path in found(f"{made_of}-*.so"):
             if _is_whole(path):
                 return path
-        raise FileNotFoundError(f"none of {', '.join(COMPILERS)} is on the path, and no cache has it")
+        raise FileNotFoundError(
+            f"none of {', '.join(COMPILERS)} is on the path, and the cache has no compiled program"
+        )
     lines, of_user = text.count("\n"), shlex.split(os.environ.get("CXXFLAGS", ""))
     # Clang, which also answers to the name of g++, knows none of these.
     if name == "lanes" and lines > _LONG and "clang" not in _version(program).lower():
@@ -246,4 +248,4 @@ def _say(name: str, reason: str) -> None:
         first = name not in _said
         _said.add(name)
     if first:
-        _log.warning("no compiled %s: plain torch or one thread serves, slower (%s)", name, reason)
+        _log.warning("%s was not compiled; plain torch or one thread runs instead, slower (%s)", name, reason)

@@ -137,7 +137,7 @@ class Contents:
         """Log, once, what cannot be watched."""
         if self.reason is not None and (name, self.reason) not in _said:
             _said.add((name, self.reason))
-            _log.warning("%s takes as it stands what cannot be watched: %s", name, self.reason)
+            _log.warning("%s: later changes of what it reads here are not noticed: %s", name, self.reason)
 
     def unchanged(self, *, library: bool = True) -> bool:
         """Return whether nothing of what can be watched has changed since.

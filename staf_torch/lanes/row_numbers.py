@@ -232,8 +232,8 @@ def over_rows(function: Callable[..., Some], *given: Tree) -> Some:
         return _mapped(function, given, met.numbers)
     if any(isinstance(leaf, RowNumbers) for leaf in flatten(found)[0]):
         raise ValueError(
-            "numbers of `rows(...)` were read in another thread than the call's, which knows no row: "
-            "compute with them where the function is called."
+            "numbers of `rows(...)` were read in another thread than the call's, where no row is chosen: "
+            "compute with them in the thread that calls the function."
         )
     return found
 
@@ -314,7 +314,7 @@ def _decides(error: Exception) -> bool:
     text = str(error)
     if "storage of BatchedTensorImpl" in text or "data pointer of Tensor that doesn't have storage" in text:
         return True  # a Python number or an array of NumPy is wanted
-    signs = ("data-dependent", ".item()", "dynamic shape", "has no part in it")
+    signs = ("data-dependent", ".item()", "dynamic shape", "`torch.func`")
     return "vmap" in text and any(sign in text for sign in signs)
 
 
@@ -345,7 +345,10 @@ def _operation(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         return leaves[at[0]]
     counts = {len(column) for column in full}
     if len(counts) > 1:
-        raise ValueError(f"`rows(...)` of {' and '.join(map(str, sorted(counts)))} rows meet in `{name}`.")
+        raise ValueError(
+            f"`rows(...)` of {' and '.join(map(str, sorted(counts)))} rows meet in `{name}`: "
+            "all must have as many rows."
+        )
 
     def one(*parts: Tensor) -> Any:
         inside = list(leaves)
@@ -395,5 +398,5 @@ def _no_single_value(name: str) -> ValueError:
 
 def _other_count(column: Tensor, count: int) -> ValueError:
     return ValueError(
-        f"a batch of {count} rows met numbers of `rows(...)` for {len(column)}: both must be one number."
+        f"a batch of {count} rows met `rows(...)` of {len(column)} rows: both must have as many rows."
     )

@@ -87,7 +87,9 @@ class SharedPrograms:
         if read.key is None:
             if not self._warned:
                 self._warned = True
-                told = "%s is traced again at every call: what it reads cannot be written down: %s"
+                told = (
+                    "%s is traced again at every call, as it reads what cannot be compared between calls: %s"
+                )
                 _log.warning(told, self._name, read.reason)
             new = Program(step, name=self._name, copies=copies)
             new.described(None, ())

@@ -227,7 +227,7 @@ def trailing(
         if not meta and value.is_meta:
             raise ValueError(f"`{call}({name}=...)` must have numbers; got a tensor on the device meta.")
         if not vmap and torch._C._functorch.is_batchedtensor(value):
-            rule = "must hold all rows at once: they are alone here, and `torch.func.vmap` has no part in it"
+            rule = "must hold all rows at once, and not one by one as under `torch.func.vmap`"
             raise ValueError(f"`{call}({name}=...)` {rule}; flatten its dimension into the rows.")
         return value
     write = "torch.as_tensor(x, dtype=torch.float64)"

@@ -25,7 +25,7 @@ def tensor_of(call: str, name: str, value: Any, *, recorded: bool = False) -> Te
         if value.requires_grad and not recorded:
             refuse_gradient(call, **{name: value})
         if torch._C._functorch.is_functorch_wrapped_tensor(value):
-            rule = "must hold all samples at once: transforms of `torch.func` have no part in it"
+            rule = "must hold all samples at once, and not one by one as under transforms of `torch.func`"
             raise ValueError(
                 f"`{call}({name}=...)` {rule}; flatten the dimension of `vmap` into the samples."
             )

@@ -186,7 +186,7 @@ def _slopes(loss: object, parameters: list[Tensor]) -> tuple[Tensor | None, ...]
     except RuntimeError as error:
         raise ValueError(
             "`ChaseOptimizer.step(closure=...)` must return the loss without calling `backward` on it; "
-            f"autograd says: {error}"
+            f"autograd's error: {error}"
         ) from error
 
 

@@ -276,7 +276,7 @@ def record_checksum(record: Mapping[str, Any]) -> str:
 def damaged(directory: Path, record: Mapping[str, Any], *, thorough: bool) -> str | None:
     """Return what is wrong with a run's record or files, None: nothing; ``thorough`` as of `damage`."""
     if "checksum" in record and record["checksum"] != record_checksum(record):
-        return f"{RUN} is damaged: its checksum is another one"
+        return f"{RUN} is damaged: its checksum does not match"
     files = record.get("files")
     return damage(directory, files, thorough=thorough) if isinstance(files, dict) else None
 
@@ -299,7 +299,7 @@ def damage(directory: Path, recorded: Mapping[str, Any], *, thorough: bool) -> s
             if size != about[0]:
                 return f"{name} is damaged: it has {size} bytes in place of {about[0]}"
             if thorough and digest(path, str(about[1])) != about[1]:
-                return f"{name} is damaged: its checksum is another one"
+                return f"{name} is damaged: its checksum does not match"
         except UnreadableError as error:
             return str(error)
         except OSError:

@@ -210,7 +210,7 @@ def _status(record: Mapping[str, Any]) -> tuple[str, str | None]:
     status, reason = record.get("status"), _text(record.get("reason"))
     if not isinstance(status, str) or status not in _UNSAID:
         by = f", written by staf_torch {record.get('version', 'of an unknown version')}"
-        raise UnreadableError(f"{RUN}{by}: the status {status!r} is not known here")
+        raise UnreadableError(f"{RUN}{by}: its status {status!r} is none that this version writes")
     return status, reason or _UNSAID[status]
 
 

@@ -132,7 +132,7 @@ class RunRecord:
             return None
         if not anyway and (told := self._differences(record)):
             raise ValueError(
-                f"{directory} was not made as it would be now: {told}. Numbers may "
+                f"{directory} was made with other settings or source: {told}. Numbers may "
                 "differ: run the sweep anew, or keep what is there by `sweep.resume_anyway=true`; tables "
                 "tell the two apart."
             )
@@ -146,7 +146,7 @@ class RunRecord:
         """
         told = self._differences(read(directory / RUN) or {}) or "its overrides were others"
         raise ValueError(
-            f"{directory} has rows that were not made as they would be now: {told}. One table of "
+            f"{directory} has rows that were made with other settings or source: {told}. One table of "
             "both would mix them: run the sweep in another directory, or begin it anew by "
             "`sweep.resume_anyway=true`."
         )

@@ -24,7 +24,7 @@ def without_setting(name: str) -> str:
         return f"there is no setting `{name}` with what is chosen; {shown} has it."
     if name in known:
         whole = name.partition(".")[0]
-        return f"`{name}` cannot be set where `{whole}` is one value: leave `{whole}=...` away."
+        return f"`{name}` cannot be set where `{whole}` is one value: omit `{whole}=...`."
     near = _near(name, known)
     return f"there is no setting `{name}`; " + (
         f"did you mean `{near}`?" if near else "`staf --help` lists them."

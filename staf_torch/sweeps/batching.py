@@ -176,7 +176,11 @@ def solve(cfgs: Sequence[DictConfig], progress: Progress) -> list[Outcome]:
     except Exception as error:
         if len(cfgs) == 1:
             return [Failed(error)]
-        _log.warning("a batch of %d cannot run as one (%s); each runs alone", len(cfgs), reason(error))
+        _log.warning(
+            "a batch of %d jobs cannot run as one tensor program (%s); they run one by one",
+            len(cfgs),
+            reason(error),
+        )
         return [outcome for cfg in cfgs for outcome in solve([cfg], progress)]
 
 

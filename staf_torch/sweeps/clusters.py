@@ -179,7 +179,9 @@ def _ended_by_signals() -> Iterator[None]:
 def _last_of_trace(said: str) -> str:
     """Return the last line of a job's traceback, which submitit frames by dashes, with its logs below."""
     lines = said.partition("You can check full logs")[0].splitlines()
-    return next((line.strip() for line in reversed(lines) if line.strip(" -")), "ended without a word")
+    return next(
+        (line.strip() for line in reversed(lines) if line.strip(" -")), "ended without a result or an error"
+    )
 
 
 class Ray(Executor):
@@ -201,7 +203,7 @@ class Ray(Executor):
                 ray.init(**{"log_to_driver": False, "include_dashboard": False, **arguments})
             except Exception as error:  # Ray raises plain ones where a daemon of its ends as it begins
                 said = " ".join(str(error).split())
-                raise LostError(f"Ray could not begin ({type(error).__name__}: {said})") from error
+                raise LostError(f"Ray could not be started ({type(error).__name__}: {said})") from error
         self._solve = ray.remote(max_retries=0)(solve_elsewhere)  # `map` tries once more
 
     @property

@@ -148,7 +148,10 @@ class Executor(abc.ABC):
                 try:
                     running[number] = self.submit(batches[number], progress)
                 except Exception as error:
-                    yield number, _failed(batches[number], f"no worker could begin ({_words(error)})")
+                    yield (
+                        number,
+                        _failed(batches[number], f"no worker process could be started ({_words(error)})"),
+                    )
             for number in self.wait(running) if running else ():
                 handle = running.pop(number)
                 try:

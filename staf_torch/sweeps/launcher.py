@@ -155,7 +155,8 @@ class AlikeFailures:
         if _differing(self._jobs) == _differing(self._jobs[failed] for failed in self._failed):
             left = len(self._jobs) - len(self._failed)
             raise ValueError(
-                f"{len(self._failed)} jobs failed alike, {left} are left as they were: {failure}"
+                f"{len(self._failed)} jobs failed with the same error, the other {left} were not run: "
+                f"{failure}"
             )
 
 
@@ -218,7 +219,9 @@ class Launch:
         rows = any((self._directory / name).exists() for name in names)
         runs = next(self._directory.glob(f"*/{RUN}"), None) is not None
         if (runs and self._in_table) or (rows and not self._in_table):
-            raise ValueError(f"{self._directory} was begun with the other `sweep.records`, which stays.")
+            raise ValueError(
+                f"{self._directory} was begun with the other value of `sweep.records`, which a sweep keeps."
+            )
 
     def _executor(self) -> Executor:
         about = self._launcher
@@ -327,7 +330,7 @@ class Launch:
         order, about = list(numbered), self._launcher
         if self._task is not execute:
             if about.foreign == "warn":
-                _log.warning("%s (hydra.launcher.foreign=run says nothing)", _NOT_BATCHED)
+                _log.warning("%s (hydra.launcher.foreign=run switches this warning off)", _NOT_BATCHED)
             yield from ((num, self._task) for num in order)
         elif len(finished) < len(order):
             with self._executor() as executor:

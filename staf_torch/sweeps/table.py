@@ -186,7 +186,7 @@ def _before(directory: Path, record: records.RunRecord, master: Any) -> Left | N
     if found is None and not anyway:
         record.refuse_rows(directory)
     if found is None:
-        _log.warning("the rows that %s has were made otherwise: all run again", directory)
+        _log.warning("%s: existing rows were made with other settings or source; recomputing all", directory)
     found = found or Left([])
     if found.made:
         _log.info("%d jobs were completed before", len(found.made))
@@ -215,7 +215,7 @@ def _refuse_others(
         if made_by(settings) != was:
             own = " ".join(records.own(jobs[first + index]))
             raise ValueError(
-                f"job {first + index} ({own}) was not made as it would be now: its settings or the modules "
+                f"job {first + index} ({own}) would be made otherwise now: its settings or the modules "
                 "that they name have changed. Run the sweep in another directory."
             )
 

@@ -34,7 +34,7 @@ class Clocked(Plant):
     def __init__(self, plant: Plant) -> None:
         super().__init__()
         if plant.dim is None:
-            raise fail("Clocked", "plant", "must say its `dim`", plant)
+            raise fail("Clocked", "plant", "must have `dim`, its number of states", plant)
         self.plant = plant
         self.dim, self.inputs, self.bounds = plant.dim + 1, plant.inputs, plant.bounds
         self.period, self.spread = plant.period, plant.spread

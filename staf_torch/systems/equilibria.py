@@ -162,8 +162,8 @@ def _motions(plant: Plant, x: Tensor, u: Tensor) -> Tensor:
             if "dtype" not in str(error) or x.dtype != torch.float64:
                 raise
             raise ValueError(
-                f"{type(plant).__name__} cannot be asked in float64, which designs and checks need: {error}. "
-                "Call `.double()` of the plant, or cast inside it."
+                f"{type(plant).__name__} cannot be evaluated in float64, which designs and checks need: "
+                f"{error}. Call `.double()` of the plant, or cast inside it."
             ) from error
 
 

@@ -119,7 +119,7 @@ class Layout:
 
     Args:
         rows: settings that tell rows apart; empty: all that were swept (without the seed where aggregated).
-        columns: settings over whose values a metric is spread.
+        columns: settings whose values become columns of each metric.
         metrics: empty: those that are declared headlines, or all of them.
         aggregates: of `AGGREGATES`; empty: none, or mean and std where a row stands for several runs.
         sort: names of columns, the best of a metric first; `:asc` the smallest, `:desc` the largest.

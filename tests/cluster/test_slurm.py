@@ -125,7 +125,7 @@ def test_a_job_out_of_time_is_told_and_not_taken_for_a_failed_batch(node: SlurmN
     assert run.returncode == 1
     (row,) = collect(place / "sweep").rows
     assert "ran into its time limit" in str(row.reason)
-    assert "each runs alone" not in out
+    assert "they run one by one" not in out
 
 
 def test_a_sweep_that_is_killed_leaves_no_job_behind(node: SlurmNode, place: Path) -> None:

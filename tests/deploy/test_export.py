@@ -234,7 +234,7 @@ def test_what_is_no_run_of_a_controller_is_refused(changed: Callable[..., Path],
     weights = history(runs / "chase")["weights"]
     weights[0, -1] = np.nan
     cases: list[tuple[Callable[[], Any], str]] = [
-        (lambda: learning(runs / "lqr"), r"`staf-export\(learning=...\)` must be left away.*'Feedback'"),
+        (lambda: learning(runs / "lqr"), r"`staf-export\(learning=...\)` must be omitted.*'Feedback'"),
         (lambda: learning(runs / "chase"), "must be a run of adp; got 'gradient_chase'"),
         (lambda: deployable(changed("chase", task="laws")), "must be a run of gradient_chase or adp; got"),
         (lambda: deployable(changed("chase", {"state": np.zeros(())})), "has no states of trajectories"),

@@ -158,6 +158,6 @@ def test_what_searches_on_the_way_is_refused_with_its_reason(memory: adp.GlobalV
         with pytest.raises(ValueError, match="must not search a memory and then optimise"):
             write()
     plan = adp.DirectShooting(plant, adp.QuadraticCost(1.0, 1.0, 2, 1)).solve(x + 0.1).replay()
-    with pytest.raises(ValueError, match="a plan of direct shooting knows no state"):
+    with pytest.raises(ValueError, match="a plan of direct shooting is no function of x"):
         deploy.policy_of(plan)
     assert not list(tmp_path.iterdir())

@@ -381,7 +381,7 @@ def test_what_cannot_be_watched_is_said_once_and_taken_as_it_stands(caplog: pyte
     for _ in range(2):
         assert ready(policy, X)
     (line,) = caplog.messages
-    assert "cannot be watched: an array of 800000 bytes" in line
+    assert "are not noticed: an array of 800000 bytes" in line
 
 
 @pytest.mark.parametrize("shape", [(2,), (1, 2), (5, 2), (3, 4, 2), (2, 1, 3, 2), (0, 2)])

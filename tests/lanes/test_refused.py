@@ -248,7 +248,7 @@ REFUSED: dict[str, tuple[Callable[[Tensor], Any], str]] = {
     "an index of a row": (lambda x: x.nonzero(), "reads a value of a row"),
     "NumPy": (lambda x: torch.as_tensor(x.numpy()), "`Tensor.numpy` takes numbers of a row out of torch"),
     "a list": (lambda x: x + x.tolist()[0][0], "`Tensor.tolist` takes numbers of a row out of torch"),
-    "another dtype": (lambda x: x.to(torch.complex128), "has no lanes here"),
+    "another dtype": (lambda x: x.to(torch.complex128), "is not supported in compiled programs"),
     "bits": (lambda x: x.long() & 1, "logic on the bits of integers"),
     "random": (lambda x: x + torch.rand(2), "draws random numbers"),
     "no rows": (lambda x: x.sum(), "an output of the step has no dimension of rows"),

@@ -157,7 +157,7 @@ def test_a_file_that_is_not_as_it_was_written_is_named(tmp_path: Path) -> None:
         assert (one.status, dict(one.metrics)) == ("unfinished", {})
         assert f"metrics.json is damaged: {said}" in str(one.reason)
     assert edited(place, files={"figure.png": [3, "0"]}).status == "completed"  # gone, and holds no number
-    assert edited(place, checksum="0").reason == "run.json is damaged: its checksum is another one"
+    assert edited(place, checksum="0").reason == "run.json is damaged: its checksum does not match"
 
 
 # Rows of a table

@@ -145,7 +145,7 @@ def test_damage_is_reported_of_the_first_file_that_has_some(tmp_path: Path) -> N
     assert damage(tmp_path, {"a": [8, right[1]]}, thorough=False) == said
     wrong = {"files": {"a": [7, "0"]}, "x": 1}
     assert damaged(tmp_path, wrong, thorough=False) is None
-    assert damaged(tmp_path, wrong, thorough=True) == "a is damaged: its checksum is another one"
+    assert damaged(tmp_path, wrong, thorough=True) == "a is damaged: its checksum does not match"
     (tmp_path / "link").symlink_to("a")
     assert damage(tmp_path, {"link": [1, right[1]]}, thorough=True) is not None
     assert damaged(tmp_path, {"a": 1, "checksum": record_checksum({"a": 1})}, thorough=True) is None
@@ -186,7 +186,7 @@ def test_any_byte_of_a_history_that_changes_is_found(how: str, tmp_path: Path) -
         changed[place] ^= 1 << place % 8
         path.write_bytes(changed)
         said = damage(tmp_path, written, thorough=True)
-        assert said == "history.npz is damaged: its checksum is another one", place
+        assert said == "history.npz is damaged: its checksum does not match", place
 
 
 # The record of a run, and of a sweep
@@ -229,14 +229,16 @@ def test_a_run_that_was_completed_before_is_found_again(
     one.write(tmp_path, "completed")
     assert one.finished(tmp_path) == {"ball": 1.0}
     many = dict.fromkeys("abcde", 2)
-    with pytest.raises(ValueError, match=rf"^{tmp_path} was not made as it would be now: a was.* and 1 more"):
+    with pytest.raises(
+        ValueError, match=rf"^{tmp_path} was made with other settings or source: a was.* and 1 more"
+    ):
         begun(**many).finished(tmp_path)
     assert begun(**many).finished(tmp_path, anyway=True) == {"ball": 1.0}
     with pytest.raises(ValueError, match="holds the run 'dt=1', where this sweep has 'dt=1 seed=2'"):
         begun(["dt=1", "seed=2"]).finished(tmp_path, anyway=True)
     (tmp_path / "metrics.json").write_text('{"ball": 2.0}')
     assert one.finished(tmp_path) is None
-    assert "metrics.json is damaged: its checksum is another one; it is run again" in caplog.text
+    assert "metrics.json is damaged: its checksum does not match; it is run again" in caplog.text
 
 
 def test_jobs_are_added_to_what_was_noted_of_the_sweep(tmp_path: Path) -> None:

@@ -149,7 +149,9 @@ def test_a_batch_that_raises_is_tried_job_by_job_and_that_is_told(caplog: pytest
     assert found[0].metrics["together"] == 1.0
     assert isinstance(found[1], Failed)
     assert str(found[1].error) == "thirteen"
-    assert caplog.messages == ["a batch of 2 cannot run as one (RuntimeError: thirteen); each runs alone"]
+    assert caplog.messages == [
+        "a batch of 2 jobs cannot run as one tensor program (RuntimeError: thirteen); they run one by one"
+    ]
     caplog.clear()
     (alone,) = solve(cfgs(13), SHOWN)
     assert isinstance(alone, Failed)

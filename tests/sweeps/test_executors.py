@@ -104,7 +104,9 @@ def test_a_batch_whose_worker_is_lost_is_tried_once_more_and_then_fails_alone(
     assert words(found[1].outcomes[0]).startswith("the worker was lost twice (ValueError: worse worse")
     assert len(words(found[1].outcomes[0])) < 400
     assert words(found[2].outcomes[0]) == "the worker was lost (cancelled)"
-    assert [words(one) for one in found[3].outcomes] == ["no worker could begin (OSError: no room)"] * 2
+    assert [words(one) for one in found[3].outcomes] == [
+        "no worker process could be started (OSError: no room)"
+    ] * 2
     assert found[4].outcomes == [Written({}, [(0, "kept")])]
     assert [line.endswith("its batch is tried once more") for line in caplog.messages] == [True] * 2
 
@@ -312,7 +314,7 @@ def test_a_ray_that_cannot_begin_says_why(clusters: Clusters, monkeypatch: pytes
         raise RuntimeError("no\n  port is free")
 
     monkeypatch.setattr(sys.modules["ray"], "init", init)
-    with pytest.raises(Exception, match=r"Ray could not begin \(RuntimeError: no port is free\)"):
+    with pytest.raises(Exception, match=r"Ray could not be started \(RuntimeError: no port is free\)"):
         swept("ray", "seed=0,1")
 
 

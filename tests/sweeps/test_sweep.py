@@ -240,7 +240,7 @@ def test_equal_failures_are_told_once_and_end_a_sweep_where_nothing_swept_matter
     directory, said = sweep(place, "alike", *wrong, code=1)
     assert said.count(f"failed: {BAD}") == 2  # as it happened, and in the table's note
     assert "23 more failed like job 0 (" in said
-    assert said.endswith(f"staf: 24 jobs failed alike, 16 are left as they were: {BAD}\n")
+    assert said.endswith(f"staf: 24 jobs failed with the same error, the other 16 were not run: {BAD}\n")
     assert len(list(directory.glob("*/run.json"))) == 24
     _, said = sweep(place, "alike_here", "centers.count=4,3", "seed=range(10)", *SHORT, code=1)
     assert "20 of 20 jobs" not in said

@@ -158,7 +158,7 @@ class Feedback(Controller):
             if name not in before or tensor is not before[name][0] or written != before[name][1]:
                 raise ValueError(
                     f"`Feedback(policy=...)` must be a function of the state; a call of {self.label} changed "
-                    f"its `{name}`. What has a memory is a `Controller`: `init` and `step` carry it by rows."
+                    f"its `{name}`. Write a policy with a memory as a `Controller`, with `init` and `step`."
                 )
 
     def value(self, x: Tensor, recorded: Mapping[str, Tensor]) -> Tensor | None:

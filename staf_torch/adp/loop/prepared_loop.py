@@ -166,7 +166,7 @@ def prepared(
     more: dict[str, Any] = settings._asdict()
     loop = ClosedLoop(controller, system, cost, holding=holding, **more)
     if learned and loop.holding.table is not None and wants_gradient(system, cost):
-        rule = "must be given where the plant or its cost requires a gradient: its exact step is a number"
+        rule = "must be given where the plant or its cost requires a gradient"
         raise fail("simulate", "substeps", rule, substeps)
     loop.to(x0.device)
     for basis in (part for part in loop.modules() if isinstance(part, StaFBasis)):

@@ -114,8 +114,8 @@ class ClosedLoop(nn.Module):
         shapes, given = ([tuple(part.shape) for part in each[0]] for each in (parts, before))
         if parts[1] != before[1] or shapes != given:
             raise ValueError(
-                f"`{type(self.controller).__name__}.step` must carry on what it got, tensors of the shapes "
-                f"{given}; got {shapes}."
+                f"`{type(self.controller).__name__}.step` must return a memory like the one it got, "
+                f"tensors of the shapes {given}; got {shapes}."
             )
         for part in (u, *parts[0]):
             good = good & torch.isfinite(part).reshape(len(part), -1).all(-1)

@@ -31,7 +31,7 @@ def check_memorable(call: str, problem: SampledProblem) -> None:
         raise fail(call, "problem", "must have a goal that stays where it is", problem.path)
     check_regulator(call, "problem", problem.unregulated)
     end = None if problem.endless else problem.end
-    check_endless(call, "problem", end, "a memory knows no end")
+    check_endless(call, "problem", end, "a memory of plans has no final time")
 
 
 class Choice(NamedTuple):

@@ -156,7 +156,7 @@ class Holding:
             if len(found) and not float(found.max()) <= GRACE * TOLERANCE:
                 _log.warning(
                     "%s: with %d integration steps a period of %.4g s the next state is wrong by up to %.2g "
-                    "of its size; leave `substeps` away for %.0e.",
+                    "of its size; omit `substeps` for %.0e.",
                     *(self.call, self.steps, self.dt, float(found.max()), TOLERANCE),
                 )
         return self

@@ -259,13 +259,13 @@ def warn_if_unstable(
             return fastest, True
         held = found.of(int(radii.argmax()), loop)
     except (RuntimeError, ValueError) as error:  # a loop runs where nobody can say whether it is stable
-        _log.info("whether the linearised loop is stable was not looked at: %s", error)
+        _log.info("the stability of the linearised loop was not checked: %s", error)
         return math.inf, False
     most = held.largest_period()
     remedy = "at no period" if most is None else f"up to {most:.4g} s"
     made = getattr(policy, "period", None)
     advice = (
-        "This policy was made for that period: look at the plant and the cost."
+        "This policy was made for that period: check the plant and the cost."
         if made == dt
         else "`LQR(plant, cost, period=dt)` is made to be held."
     )

@@ -353,7 +353,7 @@ class SampledProblem(nn.Module, metaclass=OfRows):
         kept = [*range(n), *range(self.dim, self.dim + m)]  # without the time
         slope, paid = at.cost_first[0][kept], 0.5 * at.cost_second[0][kept][:, kept]
         if self.path is None and bool(slope.abs().max() > _RESTS * (1 + paid.abs().max())):
-            raise ValueError(f"its cost has a slope there, {slope.tolist()}: it is no least")
+            raise ValueError(f"its cost has a slope there, {slope.tolist()}: it is no minimum")
         check_within("SampledProblem", "rest", self.bounds, self.rest)
         a, b = at.first[0, :n, :n], at.first[0, :n, -m:]
         mode = unstabilisable_mode(a, b, discrete=True)

@@ -39,7 +39,7 @@ _OPPOSED = (
 _FOLLOWS = (
     "the policy is left alone wherever it stays inside by itself, and what it cannot keep is `infeasible`"
 )
-_TOPPLES = "the filter acts nevertheless, as nothing tells what a policy that remembers would do"
+_TOPPLES = "the filter acts all the same: where a policy with a memory would lead is not known"
 _FOLLOWING, _BRAKING = 1000.0, 50.0  # steps of a feedback law that a control takes with such a look ahead
 _SLACK = 1e-9  # in units of the input, from which on the brakes are asked whether they do
 
@@ -249,7 +249,12 @@ class SafetyFilter(Controller):
             ValueError: if the time is missing, or the policy is a controller that remembers.
         """
         if not isinstance(self.controller, Feedback):
-            raise fail("SafetyFilter", "policy", "must be a function of x to be asked at x", self.controller)
+            raise fail(
+                "SafetyFilter",
+                "policy",
+                "must be a function of x alone, to be evaluated at x",
+                self.controller,
+            )
         try:
             u = self.controller.policy(x)
         except Exception:

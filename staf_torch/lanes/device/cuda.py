@@ -131,7 +131,7 @@ def _driver() -> Any:
         except OSError:
             continue
     if driver is None:
-        raise OSError("no driver of CUDA (libcuda.so.1) is to be found")
+        raise OSError("the CUDA driver (libcuda.so.1) was not found")
     word, size = ctypes.c_void_p, ctypes.c_uint
     driver.cuCtxSetCurrent.argtypes = (word,)
     driver.cuLaunchKernel.argtypes = (word, *[size] * 6, size, word, word, word)
@@ -145,7 +145,7 @@ def _checked(failed: int) -> None:
     if failed:
         told = ctypes.c_char_p()
         _driver().cuGetErrorString(failed, ctypes.byref(told))
-        raise OSError(f"CUDA's driver says {(told.value or b'?').decode()} ({failed})")
+        raise OSError(f"the CUDA driver reports {(told.value or b'?').decode()} ({failed})")
 
 
 def machine_code(text: str, architecture: int) -> bytes:
@@ -165,7 +165,7 @@ def machine_code(text: str, architecture: int) -> bytes:
             used(path)
             return content[:-_DIGEST]
     if compiler is None:
-        raise OSError(f"no compiler of CUDA (NVRTC) is to be found: {REMEDY}")
+        raise OSError(f"the CUDA compiler (NVRTC) was not found: {REMEDY}")
     lines = text.count("\n")
     with Sign(f"compiling {lines} lines for sm_{architecture}, once"):
         code = compiler.compile(text, architecture)

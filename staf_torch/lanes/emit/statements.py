@@ -441,7 +441,7 @@ class StatementWriter(abc.ABC):
     def _type(self, node: int) -> str:
         kind = self.graph.type[node]
         if kind not in self.types:
-            raise NotLoweredError("float64 inside a program of float32 has no lanes here")
+            raise NotLoweredError("float64 inside a program of float32 cannot be compiled")
         return self.types[kind]
 
     def _copy(self, j: int) -> str:

@@ -127,7 +127,7 @@ def searchsorted(
 ) -> Tensor:
     """Count the boundaries before x; NaN is above all."""
     if not isinstance(x, Tensor) or sorter is not None:
-        raise NotLoweredError("`searchsorted` of a number or with a sorter has no scalar form here")
+        raise NotLoweredError("`searchsorted` of a number or with a sorter cannot be compiled")
     at = x.unsqueeze(-1)
     edges = boundaries if boundaries.dim() == 1 else boundaries.unsqueeze(-2)
     passed = ~(edges > at) if right or side == "right" else ~(edges >= at)

@@ -216,7 +216,7 @@ for _name in ("eq", "ne"):
 def _logic(op: str, *names: str) -> None:
     def rule(t: Tracer, out: Tensor, *args: Any) -> Ids:
         if out.dtype != torch.bool:
-            raise NotLoweredError("logic on the bits of integers has no scalar form here", "bitwise")
+            raise NotLoweredError("logic on the bits of integers cannot be compiled", "bitwise")
         return t.map(op, *numbers(t, FLAG, *args))
 
     RULES.update(dict.fromkeys(names, rule))

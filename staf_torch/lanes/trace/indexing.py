@@ -68,7 +68,7 @@ def added_at(t: Tracer, out: Tensor, a: Tensor, dim: int, index: Tensor, source:
 def _accumulated(t: Tracer, out: Tensor, a: Tensor, index: Sequence[Tensor | None], source: Tensor) -> Ids:
     """Entries added at an index that no row computes: the slope of an entry that was read twice, say."""
     if any(isinstance(i, Tensor) and (t.traced(i) or not t.stated(i)) for i in index):
-        reason = "`aten.index_put` at an index that the row computes has no scalar form here"
+        reason = "`aten.index_put` at an index that the row computes cannot be compiled"
         raise NotLoweredError(reason, "scatter_add")
     kind = t.kind(out.dtype)
     places = torch.arange(a.numel(), device="cpu").reshape(a.shape)[
@@ -112,14 +112,14 @@ def _indexed(
     if name not in ("gather", "scatter"):
         masked = any(isinstance(i, Tensor) and i.dtype == torch.bool for i in (*_listed(dim), index))
         reason = f"`aten.{name}` at {'a mask' if masked else 'an index'} that the row computes"
-        raise NotLoweredError(f"{reason} has no scalar form here", "index" if masked else "gather")
+        raise NotLoweredError(f"{reason} cannot be compiled", "index" if masked else "gather")
     x = np.moveaxis(t.nodes(a, kind), dim, -1)
     at = np.moveaxis(t.nodes(index, WHOLE), dim, -1)
     if name == "gather":
         x = x[tuple(slice(s) for s in at.shape[:-1])]
         return np.moveaxis(_chosen(t, x[..., None, :], at), -1, dim)
     if reduce is not None:
-        raise NotLoweredError("`scatter` with reduce= has no scalar form here; `scatter_add` has one")
+        raise NotLoweredError("`scatter` with reduce= cannot be compiled; `scatter_add` can")
     source = t.nodes(rest[0], kind)
     source = np.broadcast_to(source, at.shape) if source.ndim == 0 else np.moveaxis(source, dim, -1)
     source = source[tuple(slice(s) for s in at.shape)]

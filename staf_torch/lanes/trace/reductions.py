@@ -152,7 +152,7 @@ def _slope_of_distances(
     t: Tracer, out: Tensor, slope: Tensor, a: Tensor, b: Tensor, order: float, distances: Tensor
 ) -> Ids:
     if order != 2:
-        raise NotLoweredError(f"the slope of distances of order {order} has no scalar form here")
+        raise NotLoweredError(f"the slope of distances of order {order} cannot be compiled")
     kind = t.kind(out.dtype)
     g, x, y, r = numbers(t, kind, slope, a, b, distances)
     nothing, one = t.nodes(0.0, kind), t.nodes(1.0, kind)

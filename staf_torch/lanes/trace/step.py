@@ -64,7 +64,7 @@ def lower(t: Tracer, func: Any, name: str, out: Any, args: Sequence[Any], kwargs
     if decomposition is None and func._can_decompose():  # of several operations, also in torch
         decomposition = func.decompose
     if decomposition is None:
-        raise NotLoweredError(f"`{func}` has no scalar form here", plain)
+        raise NotLoweredError(f"`{func}` cannot be compiled", plain)
     with t:
         result = decomposition(*args, **kwargs)
     parts = tensors(result)  # a slope that nobody wants is None
@@ -117,7 +117,9 @@ def trace(step: Step, given: Given, *, widened: bool = False, folded: bool = Fal
 
         def one(numbers: RowNumbers) -> Tensor:
             if folded:
-                raise NotLoweredError("it reads numbers of a row's own, of which this form has no column")
+                raise NotLoweredError(
+                    "it reads numbers of `rows(...)`, which this form of the program cannot hold"
+                )
             if id(numbers) not in own:
                 with _outside_transforms():  # met first in a derivative, say
                     found = tracer.input(numbers.full[:1], "row", len(given.row) + len(own))[0]
@@ -140,7 +142,7 @@ def trace(step: Step, given: Given, *, widened: bool = False, folded: bool = Fal
             raise NotLoweredError(_other_carry("the step returns", ends, carry))
         leaves, shape = flatten(out)
         if any(isinstance(leaf, RowNumbers) for leaf in (*ends, *leaves)):
-            raise NotLoweredError("it reads numbers of a row's own in another thread, which knows no row")
+            raise NotLoweredError("it reads numbers of `rows(...)` in another thread than the call's")
         if any(leaf.dim() == 0 or leaf.shape[0] != 1 for leaf in leaves):
             raise NotLoweredError("an output of the step has no dimension of rows")
         following = [node for end in ends for node in tracer.nodes(end).ravel().tolist()]

@@ -91,9 +91,9 @@ class Tracer(TorchDispatchMode):
         if dtype == torch.float32:  # widened: a float32 program whose numbers are carried in double
             return REAL if self.graph.single or self._widened else NARROW
         if dtype.is_complex:
-            raise NotLoweredError(f"{dtype} has no lanes here", "complex")
+            raise NotLoweredError(f"{dtype} is not supported in compiled programs", "complex")
         if dtype.is_floating_point:
-            raise NotLoweredError(f"{dtype} has no lanes here", "half")
+            raise NotLoweredError(f"{dtype} is not supported in compiled programs", "half")
         return WHOLE
 
     def attach(self, tensor: Tensor, nodes: Ids) -> Tensor:
@@ -279,7 +279,7 @@ class Tracer(TorchDispatchMode):
             return out
         masked = name == "index" and any(i is not None and i.dtype == torch.bool for i in args[1])
         if masked and any(self.traced(i) for i in args[1] if i is not None):
-            reason = "`aten.index` at a mask that the row computes has no scalar form here"
+            reason = "`aten.index` at a mask that the row computes cannot be compiled"
             raise NotLoweredError(reason, "index")  # also where it takes no entry of this row
         if name in _READS or (name != "index" and torch.Tag.dynamic_output_shape in func.tags):
             raise NotLoweredError(f"`{func}` reads a value of a row", name)

@@ -421,8 +421,8 @@ class Misfit(Hysteresis):
     ("initial", "after", "message"),
     [
         (torch.tensor(0.0), None, r"`Misfit.init` must return tensors \(B, ...\), .* B = 3; got .* \(\)"),
-        (torch.zeros(3), torch.zeros(3, 1), r"`Misfit.step` must carry on .* \[\(3,\)\]; got \[\(3, 1\)\]"),
-        (torch.zeros(3), (torch.zeros(3),), r"`Misfit.step` must carry on what it got"),
+        (torch.zeros(3), torch.zeros(3, 1), r"`Misfit.step` must return .* \[\(3,\)\]; got \[\(3, 1\)\]"),
+        (torch.zeros(3), (torch.zeros(3),), r"`Misfit.step` must return a memory like the one it got"),
     ],
 )  # fmt: skip
 def test_what_is_carried_keeps_its_form(initial: Any, after: Any, message: str) -> None:

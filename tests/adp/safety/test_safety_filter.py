@@ -127,7 +127,7 @@ def test_policies_of_all_kinds_stand_behind_it() -> None:
         run = adp.simulate(guard, LINE, COST, x0, steps=2, compile=False)
         assert not bool(run.diverged.any())
         assert guard.report(run)["minimum_margin"] > 0
-    with pytest.raises(ValueError, match="must be a function of x to be asked at x"):
+    with pytest.raises(ValueError, match="must be a function of x alone"):
         adp.SafetyFilter(learner, LINE, wall, dt=0.05)(x0)
     with pytest.raises(ValueError, match=r"must be that of the loop, 0\.1 s; got 0\.05"):
         adp.simulate(guard, LINE, COST, x0, dt=0.1, steps=1)

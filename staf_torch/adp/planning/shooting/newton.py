@@ -424,5 +424,5 @@ def why_none(known: bool, solution: NewtonSolution, left: float, row: int) -> st
         promise = float(solution.promise[row])
         if not math.isfinite(promise):
             return "not stationary: the expansion around the last trajectory is not finite or has no minimum"
-        return f"not stationary: the last model promised {promise:.2g} of the value"
+        return f"not stationary: the last quadratic model predicted a decrease by {promise:.2g} of the value"
     return f"the control misses the minimum of the Hamiltonian by {left:.2g} of the value: it is saturated"

@@ -75,7 +75,9 @@ def optima(problem: AdpProblem, x: Tensor) -> Optima | None:
             intervals=problem.optimum.intervals,
         )
         if shooting.lqr is None and shooting.stage.cost.ending is None:
-            raise ValueError("over a horizon without an LQR at its end it is that of another problem")
+            raise ValueError(
+                "without an LQR at its end, the optimum over a finite horizon is that of another problem"
+            )
         found = shooting.solve(x.flatten(0, -2).double())
     except (ValueError, RuntimeError) as error:  # the closed loop was run: it is worth keeping
         _log.warning("the optimum is not known: %s", str(error).splitlines()[0])
