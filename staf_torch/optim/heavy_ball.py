@@ -14,7 +14,7 @@ class HeavyBall(UpdateLaw):
     """v <- beta v + s g / L, a <- a + v, L = 2 lambda_max(K); v passes from one time step to the next.
 
     By default the optimal pair for the spectrum at hand, s = 4 / (1 + q)^2 and
-    beta = ((1 - q) / (1 + q))^2 with q = kappa^-1/2, whose excess shrinks by beta an iteration in the
+    beta = ((1 - q) / (1 + q))^2 with q = kappa^(-1/2), whose excess shrinks by beta an iteration in the
     limit, though not in every single one: there is no
     `UpdateLaw.contraction`. That s is above the 2 at which
     descent without momentum diverges, so a velocity reset at every time step blows up, and none is

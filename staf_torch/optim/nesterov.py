@@ -15,7 +15,7 @@ class Nesterov(UpdateLaw):
     """y = a + beta v, a <- y + s g(y) / L, v <- a - a_before, L = 2 lambda_max(K); v passes from one time
     step to the next.
 
-    By default beta = (1 - q) / (1 + q) with q = kappa^-1/2 of the spectrum at hand; with s = 1 the excess
+    By default beta = (1 - q) / (1 + q) with q = kappa^(-1/2) of the spectrum at hand; with s = 1 the excess
     then shrinks by 1 - q an iteration up to a constant, though not in every single one: there is no
     `UpdateLaw.contraction`. In rows whose y is worse than zero weights, F(y) > F(0), the velocity is dropped:
     what is left is a plain gradient step, which lowers F.

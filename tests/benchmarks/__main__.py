@@ -46,7 +46,8 @@ def bench(name: str) -> str:
 
 
 ABLATION = "staf experiment=ablation kernel=exponential centers.radius=0.1 seed=0"
-DEVICE = rf"^steepest descent M=3 +float64 +1000000(?: +\S+){{5}} +{NUMBER}"
+CARD = r"^M = 3 SteepestDescent, 100 +{} +1000000(?: +\S+){{5}} +" + NUMBER
+PEER = r"^JAX M = 3 SteepestDescent, 100 +components apart +{} +1000000 .* ours .*, +" + NUMBER
 TANGENT = "steepest_descent_x1_tangent_order_1"
 PARTS = {
     "digits": Part(
@@ -132,12 +133,16 @@ PARTS = {
         ("jax", "casadi"),
     ),
     "loops": Part(
-        bench("adp.py"),
+        bench("adp.py 1000"),
         {
-            "information law, 1000 rows, CPU s": rf"\| information \| 2 \| 1000 \|[^|]*\| {NUMBER}",
-            "control of a rollout policy, two states, us": rf"\| TwoState \| 6 \| 1 \| {NUMBER}",
+            "information law, 1000 rows, 10 s at 1 ms, CPU s": (
+                rf"\| staf_torch, information \| 2 \| 1000 \|[^|]*\| {NUMBER}"
+            ),
+            "the same in JAX": rf"\| JAX, information \| 2 \| 1000 \|[^|]*\| {NUMBER}",
+            "a control of a rollout policy, two states, us": rf"\| TwoState \| 6 \| 1 \| {NUMBER}",
+            "a control of near_optimal, pendulum, us": rf"\| near_optimal of Pendulum \|[^|]*\|[^|]*\| {NUMBER}",
         },
-        4,
+        3,
         ("jax",),
     ),
     "swing_up": Part(
@@ -178,7 +183,10 @@ PARTS = {
     ),
     "streams": Part(
         bench("streams.py --held-out --no-kafbox"),
-        {"17 held-out targets, error over the best peer, geometric mean": rf"geometric mean[^\d]*{NUMBER}"},
+        {
+            "17 held-out targets, error over the best peer, geometric mean": rf"geometric mean {NUMBER}",
+            "the largest of these ratios": rf"geometric mean .* largest {NUMBER}",
+        },
         20,
         ("river", "scikit-learn"),
     ),
@@ -186,7 +194,10 @@ PARTS = {
         bench("drifting_streams.py --kinds drifting noisy"),
         {
             "drifting stream, M = 6, times the speed of ALD-KRLS": rf"M = 6.*?: {NUMBER} times the speed",
-            "noisy stream, M = 6, rms error": rf"\| noisy \| [^|]*M = 6[^|]*\|[^|]*\| {NUMBER}",
+            **{
+                f"noisy stream, M = {m}, rms error": rf"\| noisy \| [^|]*M = {m}[^|]*\|[^|]*\| {NUMBER}"
+                for m in (3, 6, 15)
+            },
             "noisy stream, ALD-KRLS": rf"\| noisy \| ALD-KRLS[^|]*\|[^|]*\| {NUMBER}",
         },
         4,
@@ -199,7 +210,11 @@ PARTS = {
     ),
     "device": Part(
         "python -m tests.gpu",
-        {"chase_weights, M = 3, 1e6 rows, float64, G steps/s": DEVICE},
+        {
+            "chase_weights, M = 3, 1e6 rows, float64, G trajectory-steps/s": CARD.format("float64"),
+            "the same, float32": CARD.format("float32"),
+            "over JAX with components apart, float64": PEER.format("float64"),
+        },
         4,
         ("jax",),
     ),
