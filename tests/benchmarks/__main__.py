@@ -3,6 +3,7 @@
     python -m tests.benchmarks --list            # parts, minutes, commands
     python -m tests.benchmarks laws memory       # some parts, by name
     python -m tests.benchmarks                   # all of them, an hour at most
+    python -m tests.benchmarks device --output FILE   # from what its command printed on another machine
 
 A part is a command and the numbers that its output, or its metrics.json, holds. They are kept in table.json
 and printed as TABLE.md with date, commit, processor and versions of the peers; the row of a part that is not
@@ -109,7 +110,7 @@ PARTS = {
     "engine": Part(
         bench("engine.py --only SteepestDescent --centers 3 --rows 1000"),
         {"steepest descent, M = 3, 1000 rows, over JAX": rf"float64.*SteepestDescent .*over JAX {NUMBER}"},
-        4,
+        1,
         ("jax", "numba"),
     ),
     "gradients": Part(
@@ -119,7 +120,7 @@ PARTS = {
             "jax.grad over it": rf"lorenz +JAX .*: {NUMBER} times",
             "gradient through a chase, M = 3": rf"chase3 .*with gradient .*ratio {NUMBER}",
         },
-        2,
+        1,
         ("jax",),
     ),
     "plants": Part(
@@ -129,7 +130,7 @@ PARTS = {
             "JAX over it": rf"\| JAX[^|]*\|[^|]*\|[^|]*\| {NUMBER}",
             "CasADi over it": rf"\| CasADi[^|]*\|[^|]*\|[^|]*\| {NUMBER}",
         },
-        4,
+        1,
         ("jax", "casadi"),
     ),
     "loops": Part(
@@ -140,9 +141,11 @@ PARTS = {
             ),
             "the same in JAX": rf"\| JAX, information \| 2 \| 1000 \|[^|]*\| {NUMBER}",
             "a control of a rollout policy, two states, us": rf"\| TwoState \| 6 \| 1 \| {NUMBER}",
-            "a control of near_optimal, pendulum, us": rf"\| near_optimal of Pendulum \|[^|]*\|[^|]*\| {NUMBER}",
+            "a control of near_optimal, pendulum, us": (
+                rf"\| near_optimal of Pendulum \|[^|]*\|[^|]*\| {NUMBER}"
+            ),
         },
-        3,
+        4,
         ("jax",),
     ),
     "swing_up": Part(
@@ -150,7 +153,7 @@ PARTS = {
         {
             "Pendulum-v1, resets 0 to 49, mean cost": rf"'mean_cost_50': {NUMBER}",
         },
-        2,
+        1,
         ("gymnasium",),
     ),
     "filter": Part(
@@ -165,7 +168,7 @@ PARTS = {
     "evaluations": Part(
         bench("evaluate.py"),
         {"V^ and gradient at a point, eager, us": rf"^one value and gradient, eager \(us\) +{NUMBER}"},
-        2,
+        1,
     ),
     "fits": Part(
         bench("fit.py"),
@@ -178,7 +181,7 @@ PARTS = {
             "V^ and gradient by AOTInductor, float32, us": rf"float32 +AOTInductor, loader.*? {NUMBER}",
             "by onnxruntime, float32, us": rf"float32 +onnxruntime, io.*? {NUMBER}",
         },
-        3,
+        1,
         ("onnxruntime",),
     ),
     "streams": Part(
@@ -190,6 +193,18 @@ PARTS = {
         20,
         ("river", "scikit-learn"),
     ),
+    "speed": Part(
+        bench("streams_speed.py"),
+        {
+            "StaFRegressor, n = 2, M = 6, float32, us to predict a sample": (
+                rf"n = 2, M = 6, float32: predict {NUMBER} us"
+            ),
+            "us to learn it": rf"n = 2, M = 6, float32: predict \S+ us, learn {NUMBER} us",
+            "n = 6, M = 28, us to learn a sample": rf"n = 6, M = 28, float32: .* learn {NUMBER} us",
+            "MixtureRegressor of 32 neighbours, n = 4, us a sample": rf"bank of 32 neighbours.*: {NUMBER} us",
+        },
+        1,
+    ),
     "drifting": Part(
         bench("drifting_streams.py --kinds drifting noisy"),
         {
@@ -200,12 +215,12 @@ PARTS = {
             },
             "noisy stream, ALD-KRLS": rf"\| noisy \| ALD-KRLS[^|]*\|[^|]*\| {NUMBER}",
         },
-        4,
+        1,
     ),
     "sweeps": Part(
         bench("sweep.py --only batched,basic"),
         {"100 jobs, batched over Hydra's basic launcher, CPU s": rf"batched launcher takes {NUMBER}"},
-        2,
+        1,
         ("hydra-core",),
     ),
     "device": Part(
@@ -215,14 +230,14 @@ PARTS = {
             "the same, float32": CARD.format("float32"),
             "over JAX with components apart, float64": PEER.format("float64"),
         },
-        4,
+        2,
         ("jax",),
     ),
 }
 
 
 def processor() -> str:
-    """Return the name of the processor, and of the device of the part that needs one."""
+    """Return the name of the processor."""
     try:
         found = re.search(r"model name\s*:\s*(.*)", Path("/proc/cpuinfo").read_text(encoding="utf-8"))
     except OSError:
@@ -237,8 +252,17 @@ def version(distribution: str) -> str:
         return f"{distribution} not installed"
 
 
-def measure(name: str) -> dict[str, str]:
-    """Run a part; return its claims and their numbers, "not found" for one that its output does not hold."""
+def found_in(part: Part, printed: str, metrics: dict[str, Any]) -> dict[str, str]:
+    """Return the claims and their numbers, "not found" for one that neither output nor metrics hold."""
+    numbers = {}
+    for claim, where in part.claims.items():
+        found = re.search(where, printed, re.MULTILINE)
+        numbers[claim] = f"{metrics[where]:.4g}" if where in metrics else found[1] if found else "not found"
+    return numbers
+
+
+def measure(name: str) -> tuple[dict[str, str], str]:
+    """Run a part; return its claims with their numbers, and what it printed."""
     part = PARTS[name]
     folder = ROOT / "runs" / "benchmarks" / name
     shutil.rmtree(folder, ignore_errors=True)
@@ -254,25 +278,29 @@ def measure(name: str) -> dict[str, str]:
     metrics: dict[str, Any] = {}
     if (folder / "metrics.json").exists():
         metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
-    numbers = {}
-    for claim, where in part.claims.items():
-        found = re.search(where, ended.stdout, re.MULTILINE)
-        numbers[claim] = f"{metrics[where]:.4g}" if where in metrics else found[1] if found else "not found"
-    return numbers
+    return found_in(part, ended.stdout, metrics), ended.stdout
 
 
-def record(name: str, kept: dict[str, Any]) -> bool:
-    """Measure a part and keep what it says; return whether all of its numbers were found."""
+def record(name: str, kept: dict[str, Any], output: Path | None) -> bool:
+    """Measure a part, or read what it printed; keep its numbers; return whether all were found."""
     part = PARTS[name]
     began = time.monotonic()
-    numbers = measure(name)
+    if output is None:
+        numbers, printed = measure(name)
+    else:
+        printed = output.read_text(encoding="utf-8")
+        numbers = found_in(part, printed, {})
+    versions = [version(each) for each in ("torch", *part.peers)]
+    machine = f"{processor()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.0f}"
+    if card := re.search(r"^(NVIDIA [^,]*), (torch [^;]*);", printed, re.MULTILINE):
+        machine, versions = card[1], [card[2]]
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True)
     kept[name] = {
         "command": part.command,
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         "commit": commit.stdout.strip() or "unknown",
-        "machine": f"{processor()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.0f}",
-        "versions": ", ".join(version(each) for each in ("torch", *part.peers)),
+        "machine": machine,
+        "versions": ", ".join(versions),
         "numbers": {claim: number for claim, number in numbers.items() if number != "not found"},
     }
     lost = [claim for claim, number in numbers.items() if number == "not found"]
@@ -307,7 +335,12 @@ def main() -> int:
     )
     parser.add_argument("parts", nargs="*", help="all of them by default", metavar="PART")
     parser.add_argument("--list", action="store_true", help="the parts, with minutes and commands")
+    parser.add_argument(
+        "--output", type=Path, metavar="FILE", help="read what the one part printed elsewhere"
+    )
     options = parser.parse_args()
+    if options.output and len(options.parts) != 1:
+        parser.error(f"--output is of one part; got {len(options.parts)}")
     if unknown := [name for name in options.parts if name not in PARTS]:
         parser.error(f"no part {unknown[0]!r}: there are {', '.join(PARTS)}")
     if options.list:
@@ -317,7 +350,7 @@ def main() -> int:
     kept = json.loads(KEPT.read_text(encoding="utf-8")) if KEPT.exists() else {}
     good = True
     for name in options.parts or PARTS:
-        good &= record(name, kept)
+        good &= record(name, kept, options.output)
         KEPT.write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
         TABLE.write_text(markdown(kept), encoding="utf-8")
     return 0 if good else 1
