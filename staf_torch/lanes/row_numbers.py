@@ -314,7 +314,7 @@ def _decides(error: Exception) -> bool:
     text = str(error)
     if "storage of BatchedTensorImpl" in text or "data pointer of Tensor that doesn't have storage" in text:
         return True  # a Python number or an array of NumPy is wanted
-    signs = ("data-dependent", ".item()", "dynamic shape", "`torch.func`")
+    signs = ("data-dependent", ".item()", "dynamic shape", "as under `torch.func.vmap`")
     return "vmap" in text and any(sign in text for sign in signs)
 
 

@@ -312,10 +312,10 @@ def test_a_complete_table_is_not_computed_again(place: Path) -> None:
 def test_a_sweep_does_not_change_between_rows_and_directories(place: Path) -> None:
     for line in ("sweep.records=directories", TABLE):
         code, said = staf("-m", "sweep.resume=killed", line, "--trust")
-        assert (code, "which stays" in said) == ((1, True) if line != TABLE else (0, False))
+        assert (code, "which a sweep keeps" in said) == ((1, True) if line != TABLE else (0, False))
     staf_torch.sweep(*SHORT, "seed=1,2", "history=false", directory="many")
     code, said = staf("-m", "sweep.resume=many", TABLE)
-    assert (code, "which stays" in said) == (1, True)
+    assert (code, "which a sweep keeps" in said) == (1, True)
 
 
 def test_workers_leave_the_same_rows_and_those_that_are_lost_are_computed_later(place: Path) -> None:

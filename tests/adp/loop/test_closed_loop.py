@@ -490,7 +490,7 @@ class Integral(nn.Module):
 @pytest.mark.parametrize("in_place", [False, True])
 def test_a_policy_with_a_memory_is_refused(in_place: bool, buffer: bool) -> None:
     policy = adp.Feedback(Integral(in_place, buffer))
-    with pytest.raises(ValueError, match=r"changed its `total`.*is a `Controller`"):
+    with pytest.raises(ValueError, match=r"changed its `total`.*as a `Controller`"):
         run(policy)
 
 
