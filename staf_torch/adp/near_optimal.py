@@ -34,6 +34,7 @@ from .problem.rules import (
     slowest,
     warn_if_short,
 )
+from .problem.shapes import check_objects
 from .reach import Reach, extended, looked, reach_of_rows, whole
 
 _log = logging.getLogger(__name__)
@@ -125,6 +126,7 @@ def near_optimal(
         ValueError: if an argument breaks its rule, the plant has no LQR, or ``reach`` is ``global`` and there
             is no global value; the message says why.
     """
+    check_objects("near_optimal", plant=plant, cost=cost)
     choice("near_optimal", "reach", reach, _WAYS)
 
     def single(given: _Given) -> NearOptimal:

@@ -15,7 +15,7 @@ from ..lanes.one_thread import small
 from ..lanes.row_numbers import over_rows
 from ..lanes.row_objects import Rowwise, beyond_rows
 from ..local_basis import Degrees, LocalBasis, LocalSpace
-from ..numerics.checks import learns, sampled, trailing, values_of
+from ..numerics.checks import fail, learns, sampled, trailing, values_of
 from ..numerics.row_checks import check_kernel
 from .coefficient_format import compare, decode, encode, record
 
@@ -243,12 +243,14 @@ class StaFBasis(nn.Module, metaclass=Rowwise):
         centers = self.centers(x)
         try:
             found = target(centers)
-        except RuntimeError as error:
+        except (RuntimeError, TypeError) as error:
+            if not callable(target):
+                raise fail("StaFBasis", "target", "must be a function of points (..., n)", target) from error
             if "dtype" not in str(error):
                 raise
             raise ValueError(
-                f"The target must take points of {centers.dtype}, in which this basis computes: convert one "
-                f"of them by `.double()` or `.float()`; torch's error: {error}"
+                f"The target must take points of {centers.dtype}, in which this basis computes: write "
+                f"`net.double()`, or `lambda x: net(x.float())` for values of 7 digits; torch's error: {error}"
             ) from error
         values = sampled(target, found, centers, outputs)
         return values if outputs is None else values.movedim(-1, 0)

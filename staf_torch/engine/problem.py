@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..approximation.basis import StaFBasis, Target
 from ..lanes import each
-from ..numerics.checks import fail, integer, sampled, trailing
+from ..numerics.checks import fail, integer, object_of, sampled, trailing
 from ..numerics.row_checks import check_law, check_target
 from ..optim.base import LawState, UpdateLaw
 from ..optim.objective import NativeError
@@ -45,6 +45,7 @@ class Problem:
 
     def __post_init__(self) -> None:
         integer(self.call, "inner_steps", self.inner_steps, least=0)
+        object_of(self.call, StaFBasis, "`StaFBasis(kernel, centers)`", basis=self.basis)
         self.basis.check_learned()
         if not isinstance(self.law, UpdateLaw):
             raise fail(self.call, "law", "must be an UpdateLaw", self.law)

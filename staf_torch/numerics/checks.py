@@ -129,6 +129,27 @@ def integer(call: str, name: str, value: object, least: int) -> int:
     return value
 
 
+def object_of(call: str, kind: type, else_write: str = "", **given: object) -> None:
+    """Refuse what is no object of a class: the class itself, a function, a name, None.
+
+    Args:
+        call: the door.
+        kind: the class.
+        else_write: how one is made of what is often given instead.
+        given: its arguments by name.
+
+    Raises:
+        ValueError: that names the first one.
+    """
+    for name, value in given.items():
+        if isinstance(value, kind):
+            continue
+        rule = f"must be a {kind.__name__}{else_write and f': {else_write}'}"
+        if isinstance(value, type) and issubclass(value, kind):
+            rule = f"must be an object, and is the class: write `{value.__name__}(...)`"
+        raise fail(call, name, rule, value)
+
+
 def flag(call: str, name: str, value: object) -> bool:
     """True or false, and nothing that merely looks like it."""
     if not isinstance(value, bool):

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ..lanes.gradients import refuse_gradient
 from ..lanes.row_decisions import in_any_row
+from ..numerics.checks import object_of
 from ..numerics.differences import central_slopes
 from ..signs import Sign
 from .base import Plant
@@ -111,6 +112,7 @@ def find_equilibrium(
     Raises:
         ValueError: if there is none near the guess; the message says which coordinate keeps moving.
     """
+    object_of("find_equilibrium", Plant, plant=plant)
     refuse_gradient("find_equilibrium", plant=plant, x=x, u=u)
     x = torch.as_tensor(x, dtype=torch.float64, device=getattr(x, "device", "cpu"))
     u = (

@@ -22,7 +22,7 @@ from ..lanes.shared_programs import SharedPrograms
 from ..lanes.trace.step import Step
 from ..lanes.tree import Tree
 from ..lanes.when_compiled import undecided, worth
-from ..numerics.checks import integer, positive_real, trailing
+from ..numerics.checks import fail, integer, positive_real, trailing
 from ..numerics.default_device import beside
 from ..numerics.exponential_step import BENT, GRACE, MOST, TOLERANCE, TRIED, needed_steps
 from ..numerics.runge_kutta import runge_kutta_mean, runge_kutta_stages
@@ -65,6 +65,10 @@ def trajectory(
     Raises:
         ValueError: if an argument breaks its rule, or the plant returns another shape.
     """
+    if isinstance(system, type) or not callable(getattr(system, "drift", None)):
+        rule = "must be a plant with a `drift`: x' = f(x) + g(x) u, of which f is followed"
+        rule = "must be an object, and is the class" if isinstance(system, type) else rule
+        raise fail("trajectory", "system", rule, system)
     trailing("trajectory", "x0", x0, dims=2, last=getattr(system, "dim", None), meta=False, vmap=False)
     positive_real("trajectory", "dt", dt)
     total = integer("trajectory", "steps", steps, least=0) + 1

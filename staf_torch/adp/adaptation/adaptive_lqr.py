@@ -16,6 +16,7 @@ from ..loop.controller import LQR, Controller, Policy
 from ..policies.rollout import RolloutPolicy, fitted_slope
 from ..problem.cost import Cost, matvec, quadratic
 from ..problem.rules import regulated
+from ..problem.shapes import check_objects
 from .consider import Considered, ConsiderFilter
 from .least_squares import Estimate, LeastSquares
 from .parametric import ParametricPlant
@@ -99,6 +100,7 @@ class AdaptiveLQR(Controller):
         filter: ConsiderFilter | None = None,
     ) -> None:
         super().__init__()
+        check_objects("AdaptiveLQR", model=model, cost=cost)
         self.model, self.cost = model, regulated("AdaptiveLQR", model, cost)
         p = model.parameters_count
         if len(law.first) != p:

@@ -7,12 +7,13 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from ...numerics.checks import fail, positive, trailing, vector
+from ...numerics.checks import fail, object_of, positive, trailing, vector
 from ...numerics.default_device import device_of
 from ...systems import ControlAffineSystem
 from ..loop.controller import Controller
 from ..problem.cost import Cost
 from ..problem.rules import regulated
+from ..problem.shapes import check_objects
 from .bases import ValueBasis
 from .bellman import BellmanTerms, bellman_terms
 from .extrapolation import Extrapolation
@@ -66,6 +67,8 @@ class ActorCritic(Controller):
         gain: float | Tensor = 250.0,
     ) -> None:
         super().__init__()
+        object_of("ActorCritic", ValueBasis, "`StaFValueBasis(basis)` is one", basis=basis)
+        check_objects("ActorCritic", model=model, cost=cost)
         if not isinstance(model, ControlAffineSystem):
             raise fail(
                 "ActorCritic", "model", "must be a ControlAffineSystem; `near_optimal` takes others", model

@@ -12,7 +12,7 @@ from ...numerics.checks import trailing
 from ...numerics.linalg import slope_of
 from ...systems import ControlAffineSystem
 from ..problem.cost import Cost, matvec
-from ..problem.shapes import check_value
+from ..problem.shapes import check_objects, check_value
 from .bases import ValueBasis
 
 
@@ -50,6 +50,7 @@ def hjb_residual(
 
     Source: MATH.md section 4; for a quadratic cost x'Qx + f'grad V - 1/4 grad V' g R^-1 g' grad V.
     """
+    check_objects("hjb_residual", system=system, cost=cost)
     trailing("hjb_residual", "x", x, 1, cost.dim)
     check_value("hjb_residual", "value", value, cost)
     gradient = value_gradient(value, x)

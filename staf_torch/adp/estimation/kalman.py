@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ...lanes.row_objects import OfRows
 from ...numerics.angles import periods_of, wrap_each
-from ...numerics.checks import fail, non_negative, one_or_each, positive, trailing, vector
+from ...numerics.checks import fail, non_negative, object_of, one_or_each, positive, trailing, vector
 from ...numerics.linalg import row_jacobian
 from ...numerics.riccati import measured, product
 from ...numerics.row_checks import check_rows
@@ -59,7 +59,9 @@ class KalmanFilter(metaclass=OfRows):
         process: float | Sequence[float] = 0.0,
         periodic: Sequence[int] = (),
     ) -> None:
-        name, n = type(self).__name__, model._size()
+        name = type(self).__name__
+        object_of(name, Plant, model=model)
+        n = model._size()
         noises = vector(name, "noise", noise)
         if not noises or min(noises) <= 0:
             raise fail(name, "noise", "must be positive numbers, one an output", noise)

@@ -17,7 +17,7 @@ from ...lanes.loops import where_rows
 from ...lanes.one_thread import small
 from ...lanes.row_numbers import over_rows
 from ...lanes.row_objects import OfRows
-from ...numerics.checks import real, trailing
+from ...numerics.checks import fail, real, trailing
 from ...numerics.default_device import beside
 from ...numerics.linalg import riccati
 from ...numerics.shown import limits, shown
@@ -25,6 +25,7 @@ from ...systems import Plant
 from ..problem.cost import Cost, matvec, quadratic
 from ..problem.held_linear import held_riccati
 from ..problem.rules import regulated
+from ..problem.shapes import check_objects
 
 Policy = Callable[[Tensor], Tensor]
 """u from x: (..., n) -> (..., m)."""
@@ -126,6 +127,8 @@ class Feedback(Controller):
 
     def __init__(self, policy: Policy, value: Value | None = None) -> None:
         super().__init__()
+        if not callable(policy) or isinstance(policy, type):
+            raise fail("Feedback", "policy", "must be a function of x, or a module: u = policy(x)", policy)
         self.policy = policy
         self.period = getattr(policy, "period", None)
         self._value = value
@@ -250,6 +253,7 @@ class LQR(nn.Module, metaclass=OfRows):
     @small
     def __init__(self, system: Plant, cost: Cost, period: float | None = None) -> None:
         super().__init__()
+        check_objects("LQR", system=system, cost=cost)
         self.layers = gradients_of("LQR", system=system, cost=cost)
         self.cost = regulated("LQR", system, cost)
         self.period = system.period if period is None else period

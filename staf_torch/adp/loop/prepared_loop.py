@@ -209,8 +209,14 @@ def _check_control(controller: Feedback, x0: Tensor, inputs: int) -> None:
     """Refuse a policy that is not one control a row; numbers of a row's own are its matter."""
     if is_ours(controller.policy):
         return
-    with torch.no_grad():
-        u = controller.policy(x0)
+    try:
+        with torch.no_grad():
+            u = controller.policy(x0)
+    except RuntimeError as error:
+        if "dtype" not in str(error):
+            raise
+        rule = f"must take states of {x0.dtype}: write `net.double()`, or x0 in its precision"
+        raise ValueError(f"`simulate(controller=...)` {rule}; torch's error: {error}") from error
     whole = (len(x0), inputs)
     fits = isinstance(u, Tensor) and u.is_floating_point() and u.dim() in (1, 2)
     if not fits or any(size not in (1, w) for size, w in zip(u.shape, whole[-u.dim() :], strict=True)):

@@ -28,6 +28,7 @@ from ...signs import Sign
 from ...systems import Plant
 from ..problem.cost import Cost
 from ..problem.held_plant import Substeps
+from ..problem.shapes import check_objects
 from .accuracy import hardest, needed, warn_of_errors, warn_of_models
 from .controller import Controller, Feedback, Policy
 from .drawing import by_generator, generated
@@ -113,9 +114,10 @@ def simulate(
             log.
     """
     if not isinstance(controller, Controller):
-        if not callable(controller):
+        if not callable(controller) or isinstance(controller, type):
             raise fail("simulate", "controller", "must be a Controller or a function of x", controller)
         controller = Feedback(controller)
+    check_objects("simulate", system=system, cost=cost)
     settings = LoopSettings(
         controller.period or system.period or _DT if dt is None else dt, integrator, substeps, renew, limit
     )

@@ -25,6 +25,7 @@ from ...systems import Plant
 from ..loop.controller import Controller, Policy, Value
 from ..problem.cost import Cost
 from ..problem.held_plant import Holding
+from ..problem.shapes import check_objects
 from ..safety.conditions import Constraint, check_traceable, listed
 
 _AXES = 4  # at most: their combinations are 3^k - 1
@@ -108,6 +109,7 @@ class DetourRollout(Controller):
         stride: int = 1,
     ) -> None:
         super().__init__()
+        check_objects("DetourRollout", plant=plant, cost=cost)
         check_traceable("DetourRollout", plant)
         self.policy, self.plant, self.terminal, self.cost = policy, plant, terminal, cost.around(plant)
         self.constraints = listed("DetourRollout", constraints, plant)

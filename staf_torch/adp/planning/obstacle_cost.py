@@ -10,14 +10,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ...numerics.checks import choice, fail, integer, positive_real
+from ...numerics.checks import choice, fail, integer, object_of, positive_real
 from ...numerics.linalg import Matrix
 from ...numerics.row_checks import check_rows
 from ...signs import Sign
 from ...systems import Plant
 from ..problem.cost import QuadraticCost
 from ..problem.sampled import SampledProblem
-from ..problem.shapes import state_of
+from ..problem.shapes import check_objects, state_of
 from .ddp import BoxDDP
 from .trajectories import Reference, Trajectories, chosen, rows_of
 
@@ -169,6 +169,8 @@ def plan_around(
     Raises:
         ValueError: if an argument breaks its rule.
     """
+    check_objects("plan_around", plant=plant, cost=cost)
+    object_of("plan_around", AvoidanceCost, cost=cost)
     integer("plan_around", "steps", steps, least=4)
     if not shrink:
         raise fail("plan_around", "shrink", "must have at least one share", shrink)

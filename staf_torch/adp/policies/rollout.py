@@ -22,14 +22,14 @@ from ...lanes.prepared import Plan
 from ...lanes.row_functions import Rows, check_states
 from ...lanes.row_numbers import RowNumbers, points_of_rows
 from ...lanes.row_objects import Rowwise
-from ...numerics.checks import fail, integer, positive_real, trailing
+from ...numerics.checks import fail, integer, object_of, positive_real, trailing
 from ...numerics.default_device import beside, device_of
 from ...numerics.exponential_step import stalls
 from ...numerics.runge_kutta import runge_kutta_loop
 from ...systems import Barrier, ControlAffineSystem
 from ..loop.controller import LQR, Policy, Value
 from ..problem.cost import Cost
-from ..problem.shapes import check_policy, check_problem, check_value
+from ..problem.shapes import check_objects, check_policy, check_problem, check_value
 
 _NAME = "a rollout policy"
 _KEPT = 64  # forms of one state that are remembered
@@ -100,6 +100,8 @@ class RolloutPolicy(nn.Module, metaclass=Rowwise):
         period: float | None = None,
     ) -> None:
         super().__init__()
+        object_of("RolloutPolicy", StaFBasis, basis=basis)
+        check_objects("RolloutPolicy", model=model, cost=cost)
         if not isinstance(model, ControlAffineSystem):
             raise fail(
                 "RolloutPolicy", "model", "must be a ControlAffineSystem; `near_optimal` takes others", model

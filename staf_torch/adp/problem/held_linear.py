@@ -16,7 +16,7 @@ from ...lanes.gradients import without_gradient
 from ...lanes.one_thread import small
 from ...lanes.row_numbers import nonzero
 from ...lanes.row_objects import made_by_rows
-from ...numerics.checks import fail, positive_real
+from ...numerics.checks import fail, object_of, positive_real
 from ...numerics.default_device import designed_on_cpu
 from ...numerics.differences import STEP, central_slopes
 from ...numerics.exponential_step import quadratic_integral
@@ -190,6 +190,7 @@ def held_stability(
     Raises:
         ValueError: if the period breaks its rule, or the plant is clocked and ``at`` is missing.
     """
+    object_of("held_stability", Plant, system=system)
     positive_real("held_stability", "period", period)
 
     def found() -> HeldStability:

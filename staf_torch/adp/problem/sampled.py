@@ -30,7 +30,7 @@ from ...systems.bounds import Limit
 from .cost import Cost, EndValue
 from .held_plant import Holding
 from .rules import check_torch, check_undiscounted, check_within, own_period
-from .shapes import check_problem
+from .shapes import check_objects, check_problem
 from .tracking_cost import Path, TrackingCost
 
 StepFunction = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
@@ -183,6 +183,7 @@ class SampledProblem(nn.Module, metaclass=OfRows):
         Raises:
             ValueError: if an argument breaks its rule, or as in `SampledProblem`.
         """
+        check_objects("SampledProblem.of", plant=plant, cost=cost)
         check_torch("SampledProblem.of", "plant", plant)
         check_problem(plant, cost)
         cost = cost.bounded(low, high).around(plant)

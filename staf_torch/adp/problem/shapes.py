@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ...lanes.row_numbers import RowNumbers
-from ...numerics.checks import fail
+from ...numerics.checks import fail, object_of
 from ...numerics.default_device import device_of
 from ...numerics.row_checks import check_rows, is_ours
 from ...systems import ControlAffineSystem, Plant
@@ -16,6 +16,20 @@ from ...systems.user_plants import FunctionPlant
 from .cost import Cost
 
 Function = Callable[[Tensor], Tensor]
+
+
+_PLANTS = "`systems.RatePlant(f, dim=n, inputs=m)` is that of x' = f(x, u), `StepPlant` of x+ = f(x, u)"
+_COSTS = "`QuadraticCost(q, r, dim=n, inputs=m)` is x'Qx + u'Ru, a subclass with `state_rate` any other"
+
+
+def check_objects(call: str, *, cost: object, **plants: object) -> None:
+    """Refuse what is no plant, or no cost, of a door that takes these.
+
+    Raises:
+        ValueError: in the name of ``call`` and its argument; it says what to write.
+    """
+    object_of(call, Plant, _PLANTS, **plants)
+    object_of(call, Cost, _COSTS, cost=cost)
 
 
 def check_problem(plant: Plant, cost: Cost) -> None:

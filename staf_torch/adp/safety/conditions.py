@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -414,7 +414,9 @@ def _speed(rate: Tensor) -> Tensor:
 
 def listed(call: str, constraints: Constraint | Sequence[Constraint], plant: Plant) -> list[Constraint]:
     """The constraints as a list, refused in the name of ``call`` where they are no functions of rows."""
-    several = [constraints] if callable(constraints) else list(constraints)
+    several = (
+        [constraints] if callable(constraints) or not isinstance(constraints, Iterable) else [*constraints]
+    )
     if not several or not all(map(callable, several)):
         raise fail(call, "constraints", "must be h(x, t) or a list of them", constraints)
     x, t = plant.equilibrium(), plant.equilibrium().new_zeros(())

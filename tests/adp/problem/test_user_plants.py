@@ -11,7 +11,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from staf_torch import adp, systems
+import staf_torch as st
+from staf_torch import adp, optim, systems, targets
 
 PERIOD = 0.05
 
@@ -203,3 +204,47 @@ def test_share_of_the_period_that_a_control_takes_is_said_from_a_half_on(
     share = f"{100 * seconds / 0.1:.0f} % of the 0.1 s for which it is held: a slower moment and it is late"
     assert (share in caplog.text) == said
     assert bool(caplog.text) == said
+
+
+PENDULUM, COST = systems.Pendulum(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+START = torch.zeros(1, 2, dtype=torch.float64)
+DOORS = {
+    "simulate": lambda plant, cost: adp.simulate(lambda x: -x[..., :1], plant, cost, START, dt=0.1, steps=1),
+    "near_optimal": lambda plant, cost: adp.near_optimal(plant, cost, dt=0.1),
+    "DirectShooting": lambda plant, cost: adp.DirectShooting(plant, cost),
+    "LQR": lambda plant, cost: adp.LQR(plant, cost),
+    "SampledProblem.of": lambda plant, cost: adp.SampledProblem.of(plant, cost, dt=0.1),
+    "hjb_residual": lambda plant, cost: adp.hjb_residual(plant, cost, lambda x: x[..., 0], START),
+    "plan_around": lambda plant, cost: adp.plan_around(plant, cost, START, dt=0.1, steps=4),
+    "DetourRollout": lambda plant, cost: adp.DetourRollout(
+        adp.LQR(PENDULUM, COST), plant, cost, [], axes=[[1.0, 0.0]], dt=0.1, steps=4, terminal=torch.sum
+    ),
+}
+
+
+@pytest.mark.parametrize("door", DOORS)
+def test_what_is_no_plant_and_what_is_no_cost_is_refused_with_what_to_write(door: str) -> None:
+    made = rf"`{door}\((plant|system)=...\)` must be a Plant: `systems.RatePlant\(f"
+    for wrong in (lambda x, u: u, "pendulum", None, st.GaussianKernel, 3.0):
+        with pytest.raises(ValueError, match=made):
+            DOORS[door](wrong, COST)
+        with pytest.raises(ValueError, match=rf"`{door}\(cost=...\)` must be a Cost: `QuadraticCost\("):
+            DOORS[door](PENDULUM, wrong)
+    with pytest.raises(ValueError, match=r"must be an object, and is the class: write `Pendulum\(...\)`"):
+        DOORS[door](systems.Pendulum, COST)
+
+
+def test_a_plant_without_a_drift_and_a_basis_that_is_none_are_refused() -> None:
+    for wrong in (lambda x: -x, "pendulum", None, systems.Pendulum):
+        with pytest.raises(ValueError, match=r"`trajectory\(system=...\)` must be"):
+            systems.simulate(wrong, START, dt=0.1, steps=1)
+        with pytest.raises(ValueError, match=r"`chase\(basis=...\)` must be a StaFBasis: `StaFBasis\("):
+            st.chase(START[:, None], wrong, targets.Paper(), optim.Exact())
+    basis = st.StaFBasis(st.GaussianKernel(), st.StateFollowingCenters(st.rings(3), 0.1))
+    with pytest.raises(ValueError, match=r"`StaFBasis\(target=...\)` must be a function of points"):
+        basis.ideal_weights(START, "paper")
+    net = torch.nn.Linear(2, 1)
+    with pytest.raises(ValueError, match=r"must take points of torch.float64, .* write `net.double\(\)`"):
+        basis.ideal_weights(START, lambda y: net(y).squeeze(-1))
+    with pytest.raises(ValueError, match=r"`simulate\(controller=...\)` must take states of torch.float64"):
+        adp.simulate(net, PENDULUM, COST, START, dt=0.1, steps=1)

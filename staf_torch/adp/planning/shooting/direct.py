@@ -27,7 +27,7 @@ from ...problem.rules import (
     restless,
     set_point,
 )
-from ...problem.shapes import check_policy, check_problem
+from ...problem.shapes import check_objects, check_policy, check_problem
 from ..trajectories import Trajectories, chosen
 from .defaults import MOST, end_value, regulator, times
 from .merging import ROWS, cheapest, dearer, joined, merged, replaced, selected
@@ -129,6 +129,7 @@ class DirectShooting:
         starts: int = 6,
         seed: int = 0,
     ) -> None:
+        check_objects("DirectShooting", system=system, cost=cost)
         # On the CPU: a search that branches on values.
         system, cost, terminal = on_cpu(system), on_cpu(cost), on_cpu(terminal)
         base = on_cpu(base) if base is None or callable(base) else [on_cpu(each) for each in base]
