@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..approximation.basis import StaFBasis, Target
 from ..lanes import Program, Shared
-from ..lanes.device.chunks import joined
+from ..lanes.device.chunks import beside_history, joined
 from ..lanes.opaque import opaque
 from ..lanes.row_numbers import over_rows
 from ..lanes.tree import plain
@@ -177,7 +177,7 @@ def chase_weights(
         remember(key, run.program, problem, piece, everything=False, history=bool(history))
     if history:
         found = joined(recorded)
-        return ChaseWeights(found, run.carry.diverged_at.to(found.device))
+        return ChaseWeights(found, beside_history(run.carry.diverged_at, found))
     return ChaseWeights(last_weights(run.carry).unsqueeze(1), run.carry.diverged_at)
 
 

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ..approximation.basis import GramStructure
 from ..lanes import each
+from ..lanes.device.chunks import beside_history
 from ..local_basis import LocalSpace
 from ..optim.objective import Precomputed, extremes
 from .certificate import Certificate
@@ -115,9 +116,8 @@ class Numbers(NamedTuple):
         self, state: Tensor, diverged_at: Tensor, certificate: Certificate | None = None
     ) -> ChaseResult:
         """Return them as a result, all where they are."""
-        where = self.weights.device  # the processor, where a history has no room on the states' device
-        parts = {"state": state.to(where), "diverged_at": diverged_at.to(where)}
-        return ChaseResult(**parts, certificate=certificate, **self._asdict())
+        state, diverged_at = (beside_history(each, self.weights) for each in (state, diverged_at))
+        return ChaseResult(state=state, diverged_at=diverged_at, certificate=certificate, **self._asdict())
 
 
 def numbers(

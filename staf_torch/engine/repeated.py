@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ..lanes import Program
 from ..lanes.call import form, ordinary
+from ..lanes.device.chunks import beside_history
 from ..lanes.device.kernel import DeviceCall
 from ..lanes.lookups import is_users
 from ..lanes.tree import flatten, unflatten
@@ -88,7 +89,7 @@ class Repeated:
         diverged_at = rooms[chase.diverged_at]
         if self._history:
             weights = rooms[self._outputs.weights]
-            return ChaseWeights(weights, diverged_at.to(weights.device))
+            return ChaseWeights(weights, beside_history(diverged_at, weights))
         carry = chase._replace(weights=rooms[chase.weights], log_gain=rooms[chase.log_gain])
         return ChaseWeights(last_weights(carry).unsqueeze(1), diverged_at)
 

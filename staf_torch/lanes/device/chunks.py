@@ -130,6 +130,11 @@ def joined(pieces: Sequence[Tensor]) -> Tensor:
     return torch.cat([piece.cpu() for piece in pieces], dim=1)
 
 
+def beside_history(x: Tensor, history: Tensor) -> Tensor:
+    """Return a tensor where a history is; an operation of torch is spared where it is there already."""
+    return x if x.is_cpu == history.is_cpu else x.to(history.device)
+
+
 def rows_of(history: Tensor, rows: Tensor) -> Tensor:
     """Return these rows (R,) of a history where they are, also of one for which a device had no room."""
     return history[rows.to(history.device)].to(rows.device)
