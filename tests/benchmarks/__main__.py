@@ -49,6 +49,10 @@ def bench(name: str) -> str:
 ABLATION = "staf experiment=ablation kernel=exponential centers.radius=0.1 seed=0"
 CARD = r"^M = 3 SteepestDescent, 100 +{} +1000000(?: +\S+){{5}} +" + NUMBER
 PEER = r"^JAX M = 3 SteepestDescent, 100 +components apart +{} +1000000 .* ours .*, +" + NUMBER
+KERNELS = "exponential", "gaussian"
+US = r"\| pendulum \| {} +(?:\|[^|]*){{5}}\| +" + NUMBER
+PLANNERS = "near_optimal", "box-DDP", "plan followed", "PathIntegral", "GlobalValue"
+FAULTS = r"\| mass +\| {} +(?:\|[^|]*){{3}}\| +" + NUMBER
 TANGENT = "steepest_descent_x1_tangent_order_1"
 PARTS = {
     "digits": Part(
@@ -64,6 +68,26 @@ PARTS = {
         {f"error on the ball, M = {m}, r = 0.1": rf"\| +{m} +\| +\**{NUMBER}" for m in (3, 6, 10, 15)},
         1,
     ),
+    "far": Part(
+        "staf experiment=ablation kernel=exponential,gaussian 'initial_state=[20.0,0.0]' centers.radius=0.1 "
+        "centers.count=6 seed=0",
+        {
+            f"error on the ball at |x| = 20, {kernel}": rf"\| +{kernel} .*\| +\**{NUMBER}"
+            for kernel in KERNELS
+        },
+        1,
+    ),
+    "chase": Part(
+        "staf",
+        {
+            "largest error at the state, after the correction": "ultimate_error",
+            "before it": "ultimate_error_before",
+            "with ideal weights": "ideal_error",
+        },
+        1,
+    ),
+    "regulation": Part("staf experiment=adp", {"cost, two states": "cost"}, 1),
+    "three_state": Part("staf experiment=adp_three_state", {"cost, three states": "cost"}, 1),
     "laws": Part(
         "staf experiment=laws",
         {
@@ -147,6 +171,20 @@ PARTS = {
         },
         4,
         ("jax",),
+    ),
+    "planners": Part(
+        "staf experiment=rivals rivals.plants=[pendulum] "
+        "'rivals.methods=[near_optimal,box-DDP,plan followed,PathIntegral,GlobalValue]'",
+        {f"a control of {name}, pendulum, us": US.format(name) for name in PLANNERS},
+        2,
+    ),
+    "faults": Part(
+        "staf experiment=faults",
+        {
+            "AdaptiveLQR on a wrong mass, cost over the optimum, largest": FAULTS.format("adaptive"),
+            "the LQR of the design": FAULTS.format("ignorant LQR"),
+        },
+        3,
     ),
     "swing_up": Part(
         bench("swing_up.py pendulum --seeds 1 --grid 0"),
@@ -278,7 +316,9 @@ def measure(name: str) -> tuple[dict[str, str], str]:
     metrics: dict[str, Any] = {}
     if (folder / "metrics.json").exists():
         metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
-    return found_in(part, ended.stdout, metrics), ended.stdout
+    tables = [page.read_text(encoding="utf-8") for page in sorted(folder.glob("*.md"))]
+    printed = "\n".join((ended.stdout, *tables))
+    return found_in(part, printed, metrics), printed
 
 
 def record(name: str, kept: dict[str, Any], output: Path | None) -> bool:

@@ -162,7 +162,7 @@ def main() -> None:
     print(many(6, 28, torch.float32))
     print(f"one stream, n = 2, M = 6: {single(regressor(2, 6), 2)}")
     print(f"one stream, n = 6, M = 28: {single(regressor(6, 28), 6)}")
-    for neighbours in (32, 48):
+    for neighbours in (32, 56):
         model = st.MixtureRegressor(1000, neighbours)
         print(f"one stream, bank of {neighbours} neighbours, n = 4: {single(model, 4)}")
     for streams in (1, 8):

@@ -152,7 +152,10 @@ def test_a_run_says_why_it_has_no_result(
 
 def test_a_file_that_is_not_as_it_was_written_is_named(tmp_path: Path) -> None:
     place = write_run(tmp_path / "run", {}, {"ball_error": 1.0})
-    for about, said in (([3, "0"], "it has 19 bytes in place of 3"), ([19, "0"], "its checksum does not match")):
+    for about, said in (
+        ([3, "0"], "it has 19 bytes in place of 3"),
+        ([19, "0"], "its checksum does not match"),
+    ):
         one = edited(place, files={"metrics.json": about})
         assert (one.status, dict(one.metrics)) == ("unfinished", {})
         assert f"metrics.json is damaged: {said}" in str(one.reason)
