@@ -7,11 +7,22 @@
 struct Slot {  // strides of (rows, times, entries), in numbers
     int64_t row, time, entry, entries;
 };
+struct Again;
 struct Call {
     int64_t rows, times, every;
     const REAL *table;
     const Slot *slots;
     void (*parallel)(void (*)(void *), void *, unsigned, unsigned);
+    const Again *again;
+};
+// Another program that makes inputs of times, tile by tile: they stay in a cache. It runs from the first time to the
+// last, this one from the last to the first.
+struct Again {
+    void (*run)(const Call *, REAL *const *, int64_t);
+    const Call *call;
+    REAL *const *data;
+    int64_t inputs, results;
+    const int64_t *to;  // of each result: the input of a time here, or -1
 };
 
 constexpr int lanes = COPIES * W, tile_rows = TILE > lanes ? TILE : lanes, room = tile_rows + lanes;
@@ -125,6 +136,42 @@ struct Memory {
 };
 static thread_local Memory memory;
 
+// Inputs of times that another program makes of the rows of a tile.
+static thread_local Memory made;
+struct Remade {
+    const Call &call;
+    const Again &again;
+    Slot *now, *slots;  // of this program's inputs of times, and of all of the other's
+    REAL **now_data, **data;
+
+    void begin(REAL *const *from, int64_t tile) {
+        int64_t numbers = 0;
+        for (int s = 0; s < SLOTS_NOW; ++s) now[s] = call.slots[SLOTS_ROW + s], now_data[s] = from[SLOTS_ROW + s];
+        for (int64_t s = 0; s < again.inputs + again.results; ++s) slots[s] = again.call->slots[s];
+        for (int64_t k = 0; k < again.results; ++k) {
+            Slot &slot = slots[again.inputs + k];
+            const int64_t size = slot.entries * tile, here = again.to[k];
+            slot = {1, here < 0 ? 0 : size, tile, slot.entries};
+            if (here >= 0) now[here] = {1, -size, tile, slot.entries};
+            numbers += here < 0 ? size : size * call.times;
+        }
+        REAL *to = made.of(numbers);
+        for (int64_t k = 0; k < again.results; ++k) {
+            data[again.inputs + k] = to;
+            to += slots[again.inputs + k].entries * tile * (again.to[k] < 0 ? 1 : call.times);
+        }
+    }
+    void run(int64_t first, int rows) {
+        Call part = *again.call;
+        part.rows = rows, part.slots = slots, part.parallel = nullptr;
+        for (int64_t s = 0; s < again.inputs; ++s) data[s] = again.data[s] + first * slots[s].row;
+        for (int64_t k = 0; k < again.results; ++k)
+            if (again.to[k] >= 0)
+                now_data[again.to[k]] = data[again.inputs + k] + (call.times - 1) * slots[again.inputs + k].time - first;
+        again.run(&part, data, 1);
+    }
+};
+
 struct Work {
     const Call &call;
     REAL *const *data;
@@ -140,12 +187,18 @@ struct Work {
         const Slot *now = call.slots + SLOTS_ROW, *carry = now + SLOTS_NOW, *out = carry + SLOTS_CARRY;
         REAL *const *now_data = data + SLOTS_ROW, *const *carry_data = now_data + SLOTS_NOW;
         REAL *const *out_data = carry_data + SLOTS_CARRY;
+        const int64_t others = call.again ? call.again->inputs + call.again->results : 0;
+        Slot made_slots[SLOTS_NOW + others + 1];
+        REAL *made_data[SLOTS_NOW + others + 1];
+        Remade remade{call, *call.again, made_slots, made_slots + SLOTS_NOW, made_data, made_data + SLOTS_NOW};
+        if (call.again) remade.begin(data, tile), now = made_slots, now_data = made_data;
         Frame f;
         f.fixed = memory.of(numbers + lanes), f.carry = f.fixed + (ROWS + FIXED) * room, f.now = f.carry + CARRIES * room;
         f.c = call.table, f.outputs = out + SLOTS_CARRY, f.data = out_data + SLOTS_CARRY;
         f.every = call.every, f.span = span, f.recorded = (call.times + call.every - 1) / call.every;
         for (int64_t first; (first = __atomic_fetch_add(&next, tile, __ATOMIC_RELAXED)) < call.rows;) {
             f.first = first, f.rows = int(call.rows - first < tile ? call.rows - first : tile);
+            if (call.again) remade.run(first, f.rows);
             gather(call.slots, data, SLOTS_ROW, first, f.rows, f.fixed);
             gather(carry, carry_data, SLOTS_CARRY, first, f.rows, f.carry);
             for (int b = 0; b < (f.rows + lanes - 1) / lanes * lanes; b += W) prepare(f, b);
@@ -163,7 +216,7 @@ struct Work {
                 }
         }
         wait_for_streams();
-        memory.give_back();
+        memory.give_back(), made.give_back();
     }
     static void task(void *data) { static_cast<Work *>(data)->run(); }
 };
@@ -199,7 +252,8 @@ extern "C" void lanes_run(const Call *call, REAL *const *data, int64_t most_thre
     const double operations = double((call->rows + W - 1) / W) * (WORK_ROW + double(call->times) * WORK_STEP);
     if (operations < grain * double(most_threads)) most_threads = operations < grain ? 1 : int64_t(operations / grain);
     const int64_t even = (call->rows + most_threads - 1) / most_threads;
-    const int64_t wanted = (even + lanes - 1) / lanes * lanes, tile = wanted < tile_rows ? wanted : tile_rows;
+    const int64_t wanted = (even + lanes - 1) / lanes * lanes, most = call->again ? lanes : tile_rows;
+    const int64_t tile = wanted < most ? wanted : most;
     const int64_t tiles = (call->rows + tile - 1) / tile, few = call->rows < tile ? call->rows : tile;
     Work work{*call, data, few, 0};
     const int threads = int(tiles < most_threads ? tiles : most_threads);

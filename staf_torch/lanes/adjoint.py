@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from .adjoint_steps import Substituted
-from .backward import Backward, empty_rows, rows_at_once, some_rows, split
-from .call import Compiled, PlannedCall, fresh
+from .backward import Backward, empty_rows, split
+from .call import Compiled, PlannedCall
 from .device.kernel import DeviceCall
 from .given import Given
 from .log import say
@@ -80,7 +80,6 @@ class Ran(NamedTuple):
         numbers: of rows that the step reads.
         versions: of what the step reads and has no gradient.
         kept: whether the forward pass keeps the carries.
-        rows: that are taken at once where it does.
         keeps: leaves of the carry of which it does.
         budget: bytes.
     """
@@ -94,7 +93,6 @@ class Ran(NamedTuple):
     numbers: tuple[RowNumbers, ...]
     versions: tuple[tuple[Tensor, int], ...]
     kept: bool
-    rows: int
     keeps: frozenset[int]
     budget: int
 
@@ -145,9 +143,8 @@ class GradientCall:
         found = tuple(k for k, tensor in enumerate(read) if tensor.requires_grad)
         fixed = [t for t in read if not (t.requires_grad or t.is_inference())]
         work = re.search(r"WORK_STEP = (\d+)", built.trace.text.source)
-        size, real = carried(built.compiled), built.compiled.real
+        size = carried(built.compiled)
         pays = work is None or int(work[1]) > _WORTH * size
-        written = sum(shape.numel() for shape, _ in built.compiled.outputs) * real.itemsize * self.times
         return Ran(
             call=self,
             built=built,
@@ -158,7 +155,6 @@ class GradientCall:
             numbers=built.compiled.rows,
             versions=tuple((tensor, tensor._version) for tensor in fixed),
             kept=pays and self.every == 1 and size * self.rows * self.times <= _budget,
-            rows=self.rows if work is None else rows_at_once(written),
             keeps=frozenset(self.needed or range(self.sizes[2])),
             budget=_budget,
         )
@@ -178,6 +174,7 @@ class GradientCall:
         *,
         back: bool = False,
         rooms: Sequence[Tensor] = (),
+        again: Any = None,
     ) -> list[Tensor]:
         """Run a program; return what it returns.
 
@@ -188,8 +185,40 @@ class GradientCall:
             every: times from one recorded output to the next.
             back: whether from the last time to the first.
             rooms: tensors of the program's dtype to write to, on the CPU; none where they are new.
+            again: what makes inputs of times, of `again`.
         """
         where = True if rooms else given.ordinary()
+        plan, leaves = self._plan(where, built, given, own, every, back, rooms)
+        if rooms and isinstance(plan, PlannedCall):
+            plan.into(rooms, leaves, again)
+            return [*rooms]
+        found, carries = plan(leaves), len(given.carry)
+        return found if where is True or not back else [*found[:carries], *map(flipped, found[carries:])]
+
+    def again(self, built: Built, given: Given, own: Sequence[Tensor], to: Sequence[int]) -> Any:
+        """Return what makes inputs of the adjoint while that runs, on the CPU.
+
+        Args:
+            built: the program that also puts out the carry before every step.
+            given: its inputs.
+            own: columns of rows' numbers.
+            to: of each of its results, the carry before the outputs: which input of a time, or -1.
+        """
+        plan, leaves = self._plan(True, built, given, own, 1, False, ())
+        assert isinstance(plan, PlannedCall)
+        return plan.makes(leaves, to)
+
+    def _plan(
+        self,
+        where: Any,
+        built: Built,
+        given: Given,
+        own: Sequence[Tensor],
+        every: int,
+        back: bool,
+        rooms: Sequence[Tensor],
+    ) -> tuple[Plan, list[Any]]:
+        """Return the prepared call of a program, and the inputs in its order."""
         nows = given.now if where is True or not back else [flipped(leaf) for leaf in given.now]
         leaves = [*given.row, *own, *nows, *given.carry]
         forms = tuple([(x.shape, x.stride(), x.dtype) for x in map(plain, leaves)])
@@ -205,11 +234,7 @@ class GradientCall:
             else:
                 plan = DeviceCall(alone, leaves, timed, **sizes, every=every, once=0, where=where, whole=True)
             self._plans[key] = built.compiled, plan
-        if rooms and isinstance(plan, PlannedCall):
-            plan.into(rooms, leaves)
-            return [*rooms]
-        found, carries = plan(leaves), len(given.carry)
-        return found if where is True or not back else [*found[:carries], *map(flipped, found[carries:])]
+        return plan, leaves
 
     def forward(self, ran: Ran, tensors: Sequence[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
         """Return the carry with the outputs, and the carries that are kept."""
@@ -218,30 +243,24 @@ class GradientCall:
         fewer = None if ran.kept else self.program.built(given)
         end = len(ran.built.compiled.outputs)  # carries and outputs, before the carries that are kept
         if ran.kept and given.ordinary() is True:
-            return self._in_blocks(ran, given, own)
+            return self._keeping(ran, given, own)
         rooms = self.run(fewer or ran.built, given, own, self.every)
         if fewer is not None:
             return rooms, []
-        return rooms[:end], [room.movedim(0, -1).unsqueeze(0) for room in rooms[end:]] if ran.kept else []
+        return rooms[:end], rooms[end:] if ran.kept else []
 
-    def _in_blocks(self, ran: Ran, given: Given, own: Sequence[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
-        """Keep the carries of a block of rows in memory of their own: pages that are far apart cost more."""
-        compiled, rows = ran.built.compiled, min(ran.rows, self.rows)
+    def _keeping(self, ran: Ran, given: Given, own: Sequence[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
+        """The results, and the carry before every time of those leaves that the adjoint reads."""
+        compiled, (rows, times) = ran.built.compiled, (self.rows, self.times)
         like, end = torch.empty(0, dtype=compiled.real, device="cpu"), len(compiled.outputs)
-        results = [empty_rows(like, self.rows, (), shape) for shape, _ in compiled.carry]
         made = compiled.outputs[: end - self.sizes[2]]
-        results += [empty_rows(like, self.rows, (self.times,), shape) for shape, _ in made]
-        shapes = [(-(-self.rows // rows), self.times, *shape, rows) for shape, _ in compiled.carry]
+        results = [empty_rows(like, rows, (), shape) for shape, _ in compiled.carry]
+        results += [empty_rows(like, rows, (times,), shape) for shape, _ in made]
         kept = [
-            fresh(like, *shape) if k in ran.keeps else fresh(like, 1, 1, *shape[2:]).expand(shape)
-            for k, shape in enumerate(shapes)
+            empty_rows(like, rows, (times if k in ran.keeps else 1,), shape).expand(rows, times, *shape)
+            for k, (shape, _) in enumerate(compiled.carry)
         ]
-        for k, start in enumerate(range(0, self.rows, rows)):
-            block = slice(start, min(start + rows, self.rows))
-            rooms = [room[block] for room in results] + [
-                x[k].movedim(-1, 0)[: block.stop - start] for x in kept
-            ]
-            self.run(ran.built, some_rows(given, block), [x[block] for x in own], 1, rooms=rooms)
+        self.run(ran.built, given, own, 1, rooms=[*results, *kept])
         dtypes = [dtype for _, dtype in (*compiled.carry, *made)]
         return [room.to(dtype) for room, dtype in zip(results, dtypes, strict=True)], kept
 

@@ -1,9 +1,10 @@
 """The backward pass of a program: blocks of rows, each from the last time to the first.
 
-The adjoint needs the carry before every step. If the forward pass has not kept it, it is computed again, of
-as many rows as the caches hold; and where even their carries go beyond the budget, those of some times first
-and then those between them. Sums over rows are taken of 64 rows each by halves, and of these sums by halves:
-the order depends on the number of rows alone.
+The adjoint needs the carry before every step. If the forward pass has not kept it, it is computed again: on
+the CPU within the adjoint, of the few rows that it takes at once (`_driver.hpp`), elsewhere of all rows
+before; and where that goes beyond the budget, the carries of some times first and then those between them.
+Sums over rows are taken of 64 rows each by halves, and of these sums by halves: the order depends on the
+number of rows alone.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from .program import Program
 
 _UNIT = 64  # rows that are summed first, whatever the threads
-_CACHED = 2**21  # bytes of carries, a thread, that are computed again at once
+_ROWS = 32  # that the adjoint takes at once, at most
 
 
 class Backward:
@@ -87,7 +88,6 @@ class Backward:
         times = () if self.built is None else self.built.trace.times
         self._needed = {k for k in times if k < len(self._carry)}
         call.needed.update(self._needed)
-        self._held: dict[tuple[int, int], list[Tensor]] = {}
         used = [] if self.built is None else self.built.compiled.rows
         places = {id(numbers): k for k, numbers in enumerate(ran.numbers)}
         self._read = [self._own[places[id(numbers)]] for numbers in used]
@@ -206,14 +206,16 @@ class Backward:
         size = max(1, sum(shape.numel() for shape, _ in compiled.carry) * compiled.real.itemsize)
         sums = sum((x.numel() if shared else x[0].numel()) for x, shared in self._summed) * 8
         most = self._ran.budget // (4 * sums + 1)  # rows of which the sums fit
+        rows = max(unit, most // unit * unit) if self._on_processor or not kept else call.rows
         if kept:
-            return self._ran.rows if self._on_processor else max(unit, most // unit * unit), call.times
-        room = rows_at_once(size * call.times) if self._on_processor else call.rows
-        rows = max(unit, min(room, most) // unit * unit)
-        held = min(rows, call.rows) * size
+            return rows, call.times
+        # A thread of the CPU has a few rows' carries of all times at once, a device those of all rows.
+        held = size * (_ROWS * threads if self._on_processor else min(rows, call.rows))
         if held * call.times <= self._ran.budget:
             return rows, call.times
-        return rows, min(call.times, max(math.isqrt(call.times) + 1, self._ran.budget // (2 * held)))
+        times = min(call.times, max(math.isqrt(call.times) + 1, self._ran.budget // (2 * held)))
+        begins = size * -(-call.times // times)
+        return max(unit, min(rows, self._ran.budget // (2 * begins)) // unit * unit), times
 
     def _block(
         self, rows: slice, times: int, kept: Sequence[Tensor], at_times: _AtTimes
@@ -228,11 +230,14 @@ class Backward:
         slopes, sums = self._slopes(rows), None
         for start, begin in zip(reversed(starts), reversed(begins), strict=True):
             piece = slice(start, min(start + times, call.times))
-            before = self._kept(kept, rows) if kept else self._carries(rows, piece, begin, 1)
+            before, again = [x[rows] for x in kept], None
+            if not kept:
+                before, again = self._again(rows, piece, begin)
             given = self._given(rows, piece, slopes, before, sums)
             own = [column[rows] for column in self._read]
             assert self.built is not None
-            found = call.run(self.built, given, own, 1, back=True, rooms=self._rooms(rows, piece, at_times))
+            rooms = self._rooms(rows, piece, at_times)
+            found = call.run(self.built, given, own, 1, back=True, rooms=rooms, again=again)
             slopes, sums, slow = split(found, (len(slopes), len(self._summed), len(at_times.leaves)))
             at_times.put(rows, piece, slow)
         return slopes, sums or []
@@ -246,31 +251,25 @@ class Backward:
         """The carry before times of some rows, computed again."""
         if not begin:
             return []
+        given, own = self._once_more(rows, times, begin)
+        return self._call.run(self._ran.built, given, own, every)[-len(begin) :]
+
+    def _again(self, rows: slice, times: slice, begin: Sequence[Tensor]) -> tuple[list[Tensor], Any]:
+        """The carry before times of some rows, and what makes it while the adjoint runs, if that is so."""
+        if not self._on_processor or not begin:
+            return self._carries(rows, times, begin, 1), None
+        compiled, count = self._ran.built.compiled, len(begin)
+        like = torch.empty(0, dtype=compiled.real, device="cpu")
+        shape = rows.stop - rows.start, times.stop - times.start
+        before = [empty_rows(like, shape[0], (1,), s).expand(*shape, *s) for s, _ in compiled.carry]
+        to = [-1] * len(compiled.outputs) + [k if k in self._needed else -1 for k in range(count)]
+        return before, self._call.again(self._ran.built, *self._once_more(rows, times, begin), to)
+
+    def _once_more(self, rows: slice, times: slice, begin: Sequence[Tensor]) -> tuple[Given, list[Tensor]]:
+        """Return the inputs of the call, of some rows and times, and its columns."""
         row, now = self._some(self._row, rows, None), self._some(self._now, rows, times)
-        count, length = rows.stop - rows.start, times.stop - times.start
-        given = Given([*begin], now, row, self._call.structures, count, length)
-        own = [column[rows] for column in self._own]
-        rooms = self._scratch(count, length) if self._on_processor and every == 1 else []
-        return self._call.run(self._ran.built, given, own, every, rooms=rooms)[-len(begin) :]
-
-    def _scratch(self, rows: int, times: int) -> list[Tensor]:
-        """Memory for what is computed again, the same for all blocks: one time of what nobody reads."""
-        if (rows, times) not in self._held:
-            compiled, carries = self._ran.built.compiled, len(self._carry)
-            like, made = torch.empty(0, dtype=compiled.real, device="cpu"), len(compiled.outputs) - carries
-            found = [empty_rows(like, rows, (), shape) for shape, _ in compiled.carry]
-            for k, (shape, _) in enumerate(compiled.outputs):
-                length = times if k - made in self._needed else 1
-                found.append(empty_rows(like, rows, (length,), shape).expand(rows, times, *shape))
-            self._held = {(rows, times): found}
-        return self._held[rows, times]
-
-    def _kept(self, kept: Sequence[Tensor], rows: slice) -> list[Tensor]:
-        """The carry before every time of some rows, of those that are kept, (blocks, T, ..., rows)."""
-        if len(kept[0]) == 1:
-            return [x[0].movedim(-1, 0)[rows] for x in kept]
-        block, count = rows.start // self._ran.rows, rows.stop - rows.start
-        return [x[block].movedim(-1, 0)[:count] for x in kept]
+        sizes = rows.stop - rows.start, times.stop - times.start
+        return Given([*begin], now, row, self._call.structures, *sizes), [x[rows] for x in self._own]
 
     def _rooms(self, rows: slice, times: slice, at_times: _AtTimes) -> list[Tensor]:
         """Return the place of a block: outputs of times lie among those of all rows."""
@@ -370,25 +369,11 @@ class _AtTimes:
         ]
 
 
-def rows_at_once(size: int) -> int:
-    """Return how many rows of so many bytes the caches of the processors hold, 64 a thread at least."""
-    threads = torch.get_num_threads()
-    unit = _UNIT * threads
-    return max(unit, _CACHED * threads // max(1, size) // unit * unit)
-
-
 def empty_rows(like: Tensor, rows: int, times: tuple[int, ...], shape: Sequence[int]) -> Tensor:
     """Return an empty tensor (rows, *times, *shape) in whose memory the rows are innermost."""
     size = torch.Size(shape).numel() * rows
     strides = (1, *[size for _ in times], *inner_strides(shape, rows))
     return fresh(like, *times, size).as_strided((rows, *times, *shape), strides)
-
-
-def some_rows(given: Given, rows: slice) -> Given:
-    """Return the inputs of some rows."""
-    row, now = ([x if isinstance(x, Shared) else x[rows] for x in part] for part in (given.row, given.now))
-    carry = [x[rows] for x in given.carry]
-    return Given(carry, now, row, given.structures, rows.stop - rows.start, given.times)
 
 
 def _copied(leaf: Any) -> Any:

@@ -63,7 +63,15 @@ class _Slot(ctypes.Structure):
 class _CallRecord(ctypes.Structure):
     _fields_ = (
         *((n, ctypes.c_int64) for n in ("rows", "times", "every")),
-        *((n, ctypes.c_void_p) for n in ("table", "slots", "parallel")),
+        *((n, ctypes.c_void_p) for n in ("table", "slots", "parallel", "again")),
+    )
+
+
+class _AgainRecord(ctypes.Structure):
+    _fields_ = (
+        *((n, ctypes.c_void_p) for n in ("run", "call", "data")),
+        *((n, ctypes.c_int64) for n in ("inputs", "results")),
+        ("to", ctypes.c_void_p),
     )
 
 
@@ -250,6 +258,23 @@ class PlannedCall:
         self._call.parallel = _parallel()
         self._reference = ctypes.addressof(self._call)
 
+    def makes(self, leaves: Sequence[Any], to: Sequence[int]) -> Any:
+        """Return what lets this program make inputs of times of another, a few rows at a time.
+
+        The other one reads them from the last time to the first.
+
+        Args:
+            leaves: inputs of this one, of which every time is recorded.
+            to: of each of its results, the carry before the outputs: which input of a time, or -1.
+        """
+        given = self._as_read(leaves)
+        packed = ctypes.c_char_p(self._packed(*map(_address, given), *[0] * len(to)))
+        places = (ctypes.c_int64 * len(to))(*to)
+        run, data = (ctypes.cast(x, ctypes.c_void_p) for x in (self._compiled.call, packed))
+        record = _AgainRecord(run, self._reference, data, len(given), len(to), ctypes.addressof(places))
+        record.kept = self, given, packed, places
+        return record
+
     def _reverse(self, slots: list[_Slot], steps: int, recorded: int) -> list[int]:
         """Turn the times of all slots around; return the bytes from an address to that of the last time."""
         inputs = len(slots) - len(self._compiled.carry) - len(self._compiled.outputs)
@@ -295,30 +320,38 @@ class PlannedCall:
             rooms[k] = rooms[k].to(dtype)
         return rooms
 
-    def into(self, rooms: Sequence[Tensor], leaves: Sequence[Any]) -> None:
+    def into(self, rooms: Sequence[Tensor], leaves: Sequence[Any], again: Any = None) -> None:
         """Write the carry after the last step and the outputs into tensors of the program's dtype.
 
         Args:
             rooms: as the examples, or as a call makes them.
             leaves: inputs of the forms that the examples had.
+            again: what makes some of them, of `makes`.
         """
-        given: Sequence[Any] = leaves
-        if self._compiled.rows:
-            given = self._with_columns(leaves)
-        if not self.direct:
-            given = [leaf.tensor if type(leaf) is Shared else leaf for leaf in given]
-            for k in self._copied:
-                given[k] = given[k].to(self._compiled.real).contiguous()
+        given, reference = self._as_read(leaves), self._reference
+        if again is not None:
+            call = _CallRecord.from_buffer_copy(self._call)  # another thread may be at this one
+            call.again = ctypes.addressof(again)
+            reference = ctypes.addressof(call)
         if self._late is None:
             addresses = self._packed(*map(_address, given), *map(_address, rooms))
         else:
             starts = map(_address, (*given, *rooms))
             addresses = self._packed(*map(operator.add, starts, self._late))
         if self._rows_and_times < _MANY:
-            self._compiled.call(self._reference, addresses, torch.get_num_threads())
+            self._compiled.call(reference, addresses, torch.get_num_threads())
         else:
             with Sign("compiled code"):
-                self._compiled.call(self._reference, addresses, torch.get_num_threads())
+                self._compiled.call(reference, addresses, torch.get_num_threads())
+
+    def _as_read(self, leaves: Sequence[Any]) -> Sequence[Any]:
+        """Return the inputs as compiled code reads them."""
+        given = self._with_columns(leaves) if self._compiled.rows else leaves
+        if not self.direct:
+            given = [leaf.tensor if type(leaf) is Shared else leaf for leaf in given]
+            for k in self._copied:
+                given[k] = given[k].to(self._compiled.real).contiguous()
+        return given
 
     def _with_columns(self, leaves: Sequence[Any]) -> list[Any]:
         return [*leaves[: self._once], *columns(self._compiled.rows, self._rows), *leaves[self._once :]]
