@@ -1,6 +1,6 @@
 // Tiles of rows through pieces of time. What a program must define before: the numbers of entries ROWS, NOWS,
-// AHEAD, CARRIES, FIXED, the slots SLOTS_*, COPIES of a vector that advance together, the operations WORK_ROW of a row
-// and WORK_STEP of a step, and `prepare`, `ahead` and `advance`.
+// AHEAD, CARRIES, FIXED, the slots SLOTS_*, which inputs of times are READ, COPIES of a vector that advance together,
+// the operations WORK_ROW of a row and WORK_STEP of a step, and `prepare`, `ahead` and `advance`.
 
 #pragma once
 
@@ -96,6 +96,7 @@ __attribute__((noinline)) static int transposed(const REAL *from, int64_t row, i
 }
 INLINE void gather_times(const Slot *slot, REAL *const *data, int slots, const Frame &f, REAL *to) {
     for (int s = 0; s < slots; to += slot->entries * f.span, ++s, ++slot) {
+        if (!READ[s]) continue;
         const REAL *const from = data[s] + f.first * slot->row + f.time * slot->time;
         const int entries = int(slot->entries);
         const bool dense = slot->time == entries && (slot->entry == 1 || entries == 1) && slot->row > 1;

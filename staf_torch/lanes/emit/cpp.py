@@ -22,6 +22,7 @@ _WRITTEN_OUT = 8  # entries of an output that are stored one by one
 _CALLED = 64  # functions beyond which each is compiled once and called: written out, one takes g++ 20 ms
 _LIBRARY = frozenset(("exp", "expm1", "log", "log1p", "sin", "cos", "tan", "tanh"))
 _MANY = 1500  # nodes of which even a matrix that the vectors share does not pay for twice the text
+_NEAR = 32  # numbers that loops collected, of each time and row
 _COSTLY, _MEMORY = 20, 4  # operations that a function takes, and that a number written and read is worth
 _FUNCTIONS = frozenset(
     ("exp", "expm1", "log", "log1p", "sin", "cos", "tan", "tanh", "atan2", "pow", "sqrt", "div")
@@ -58,7 +59,12 @@ def emit(graph: Graph, layout: Sizes, following: Sequence[int], outputs: Sequenc
 
 
 def _worth(graph: Graph, schedule: Schedule) -> bool:
-    """Return whether to compute ahead what times alone decide, although it goes through memory."""
+    """Return whether to compute ahead what times alone decide, although it goes through memory.
+
+    What loops collected for the passes of an adjoint would not stay in the nearest cache.
+    """
+    if sum(graph.size(n) for n in schedule.cut_ahead() if graph.op[n] == "collect") > _NEAR:
+        return False
     work = sum(_COSTLY if graph.op[n] in _FUNCTIONS else 1 for n in schedule.ahead if graph.op[n] != "now")
     return work > _MEMORY * len(schedule.cut_ahead())
 
@@ -89,8 +95,9 @@ def _work(graph: Graph, schedule: Schedule) -> dict[str, int]:
 def _copies(schedule: Schedule) -> int:
     """Return the number of vectors that advance side by side, so that the processor is never idle."""
     steps = schedule.live - schedule.ahead
+    waits = len(steps) < _MANY and any(map(schedule.reads_back, steps))  # for the pass before
     shares = len(steps) < _MANY and any(schedule.shares_a_matrix(node) for node in steps)
-    return 2 if len(steps) < _FEW or shares else 1
+    return 2 if len(steps) < _FEW or shares or waits else 1
 
 
 class _CppWriter(TableWriter):
@@ -120,6 +127,8 @@ class _CppWriter(TableWriter):
         counts |= {"SLOTS_CARRY": len(layout.carries), "COPIES": self.copies, "TILE": 64}
         counts |= _work(self.graph, self.schedule)
         single, graph = self.graph.single, self.graph
+        used = {graph.aux[node][0] for node in self.schedule.live if graph.op[node] == "now"}
+        read = [str(int(k in used)) for k in range(max(1, len(layout.nows)))]
         functions = sum(graph.op[node] in _LIBRARY for node in self.schedule.live) * self.copies
         calls = ["#define LANES_CALLS 1"] if functions > _CALLED else []
         head = [f"#define LANES_SINGLE {int(single)}", f"#define REAL {'float' if single else 'double'}"]
@@ -127,6 +136,7 @@ class _CppWriter(TableWriter):
             *calls,
             '#include "_lanes.hpp"',
             f"constexpr int {', '.join(f'{k} = {v}' for k, v in counts.items())};",
+            f"constexpr bool READ[] = {{{', '.join(read)}}};",
         ]
         source = [*head, '#include "_driver.hpp"', *prepare, *ahead, *advance]
         return Text("\n".join(source) + "\n", self.table, self.parameters)

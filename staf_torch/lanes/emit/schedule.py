@@ -112,6 +112,10 @@ class Schedule:
         packs = [a for a in graph.args[node] if graph.op[a] == "pack"] if graph.op[node] == "dot" else []
         return any(graph.op[graph.args[pack][0]] in FIXED for pack in packs)
 
+    def reads_back(self, node: int) -> bool:
+        """Return whether a node is an entry that a loop takes from the last to the first."""
+        return self._graph.op[node] == "load" and self._graph.aux[node][2] < 0
+
     def together(self, one: int, other: int) -> bool:
         """Return whether two nodes stand in the same block: of one loop, or of one depth outside of all."""
         return self._where[one] == self._where[other]

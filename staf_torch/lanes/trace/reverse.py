@@ -54,6 +54,9 @@ class Reverse:
         self._found: dict[tuple[str, int], dict[int, int]] = {slot: {} for slot in slots}
         self._arrays: dict[tuple[str, int], list[list[Operand]]] = {}  # products that are added
         self._active: list[bool] = []
+        self._values: dict[
+            int, int
+        ] = {}  # in a loop: what stands for a number that is kept or follows from one
         self._depend()
 
     def run(self, ends: Sequence[tuple[int, int]]) -> None:
@@ -214,7 +217,8 @@ class Reverse:
         def apply(op: str, *args: int) -> int:
             return graph.where(*args) if op == "where" else graph.apply(op, *args)
 
-        slopes = slopes_of(op, slope, args, node, wanted, apply, lambda x: graph.constant(x, REAL))
+        read, out = [*map(self._value, args)], self._value(node)
+        slopes = slopes_of(op, slope, read, out, wanted, apply, lambda x: graph.constant(x, REAL))
         for argument, one in zip(args, slopes, strict=True):
             if one is not None:
                 self._give(argument, one)
@@ -281,6 +285,7 @@ class Reverse:
         end = len(self._active)
         places = [k for k, one in enumerate(moving) if one]
         slopes = [graph.add("carry", (), REAL, (number, j), depth) for j in range(len(places))]
+        self._values = self._known_anyhow(self._step.held(self._step.kept[node], number), first, end)
         self._around, self._arrays_around = {}, {}
         for k, slope in zip(places, slopes, strict=True):
             self._give(after[k], slope)
@@ -314,6 +319,19 @@ class Reverse:
                 self._give_entry(array, at + p * stride, entry(graph, collected(graph, number, part), p))
         for array, pairs in factors:
             self._give_whole(array, self._over_passes(number, graph.size(array), pairs))
+
+    def _value(self, node: int) -> int:
+        return self._values.get(node, node)
+
+    def _known_anyhow(self, held: dict[int, int], first: int, end: int) -> dict[int, int]:
+        """Return what stands for numbers of a pass where some are read, and not computed again."""
+        graph, values = self._graph, dict(held)
+        for node in range(first, end):
+            args = graph.args[node]
+            if node not in values and not values.keys().isdisjoint(args):
+                given = [values.get(a, a) for a in args]
+                values[node] = graph.add(graph.op[node], given, graph.type[node], graph.aux[node])
+        return values
 
     def _factors(self, back: Loop, arrays: dict[int, list[int]]) -> list[tuple[int, list[list[Any]]]]:
         """Let a loop collect the factors of slopes by arrays outside of it: for each its place in that."""
@@ -370,18 +388,19 @@ class Reverse:
         graph, args = self._graph, self._graph.args[node]
         op, shape, *places = graph.aux[node]
         operands, here, one = [*zip(args, places, strict=True)], (slopes, _all(shape)), (self._one, None)
+        read = [(self._value(a), p) for a, p in operands]
         wanted = [self._active[a] for a in args]
         if op == "mul":
             for k in (0, 1):
                 if wanted[k]:
-                    self._send(*operands[k], shape, here, operands[1 - k])
+                    self._send(*operands[k], shape, here, read[1 - k])
             return
 
         def apply(op: str, *given: Operand) -> Operand:
             return self._mapped(op, shape, *given)
 
-        out = (node, _all(shape))
-        found = slopes_of(op, here, operands, out, wanted, apply, lambda x: (graph.constant(x, REAL), None))
+        out = (self._value(node), _all(shape))
+        found = slopes_of(op, here, read, out, wanted, apply, lambda x: (graph.constant(x, REAL), None))
         for operand, slope in zip(operands, found, strict=True):
             if slope is not None:
                 self._send(*operand, shape, slope, one)
@@ -392,7 +411,8 @@ class Reverse:
         operands = [*zip(args, places, strict=True)]
         for k in (0, 1):
             if self._active[args[k]]:
-                self._send(*operands[k], (outs, count), here, operands[1 - k])
+                other, at = operands[1 - k]
+                self._send(*operands[k], (outs, count), here, (self._value(other), at))
 
     def _send(self, target: int, places: Any, shape: Sequence[int], a: Operand, b: Operand) -> None:
         """Add products, one an entry of ``shape``, to the slopes at places of a target."""

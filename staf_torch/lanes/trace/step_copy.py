@@ -5,10 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ..emit.schedule import Sizes
-from .graph import NOW, ROW, STEP, Graph, Loop
+from .graph import NOW, REAL, ROW, STEP, Graph, Loop
 from .tracer import NotLoweredError
 
 _MOST = 40_000  # nodes of a program whose loops are written out
+_COSTLY, _WORTH = 20, 3  # operations that a function takes, and that a number written and read is worth
+_FUNCTIONS = frozenset(
+    ("exp", "expm1", "log", "log1p", "sin", "cos", "tan", "tanh", "atan2", "pow", "sqrt", "div")
+)
+_ARRAYS = ("map", "dot")
+_KEPT = _FUNCTIONS.union(_ARRAYS, ("add", "sub", "mul", "neg", "abs", "where", "min", "max"))
 
 
 class NoReverseError(NotLoweredError):
@@ -39,6 +45,8 @@ class StepCopy:
         self._ends: dict[int, list[int]] = {}  # of loops: their results, and what they collected
         self._collected: dict[int, list[int]] = {}
         self.kept: dict[int, int] = {}
+        self._last: dict[int, int] = {}  # of loops: the one that stays
+        self._held: dict[int, list[int]] = {}  # of loops: the numbers of a pass that are not computed again
         self._copy(roots)
         self.roots = [self._at(root) for root in roots]
 
@@ -115,6 +123,18 @@ class StepCopy:
         self._copy([*loop.following, *(node for part in loop.collected for node in part)])
         return [*map(self._at, loop.following)], [[*map(self._at, part)] for part in loop.collected]
 
+    def held(self, number: int, here: int) -> dict[int, int]:
+        """Return what a loop has kept of the numbers of a pass of ``here``, which takes them in reverse."""
+        loop, before, known = self._of.loops[number], self._last[number], self._known
+        found = dict[int, int]()
+        for part, node in enumerate(self._held[number], len(loop.collected)):
+            array, size = collected(self.graph, before, part), self._of.size(node)
+            places = [((loop.count - 1) * size + k, -size) for k in range(size)]
+            loads = [self.graph.add("load", (array,), REAL, (here, *p), STEP + 1) for p in places]
+            whole = self._of.op[node] in _ARRAYS
+            found[known[loop.depth][node]] = self.graph.add("pack", loads, REAL, size) if whole else loads[0]
+        return found
+
     def _keep(self, number: int) -> int:
         old, new, here = self._of.loops[number], self.graph, len(self.graph.loops)
         loop = Loop(old.count, STEP + 1)
@@ -123,6 +143,8 @@ class StepCopy:
         kinds = [self._of.type[node] for node in old.carry]
         loop.carry = [new.add("carry", (), kind, (here, k), STEP + 1) for k, kind in enumerate(kinds)]
         loop.following, loop.collected = self.body(number, here, loop.carry, back=False)
+        self._last[number], self._held[number] = here, self._long(number)
+        loop.collected += [self._entries(node) for node in self._held[number]]
         loop.collected += [[node] for node in loop.carry]
         new.close(here)
         self.kept[loop.node] = number
@@ -131,6 +153,32 @@ class StepCopy:
         ]
         self._collected[number] = [collected(new, here, k) for k in range(len(old.collected))]
         return loop.node
+
+    def _long(self, number: int) -> list[int]:
+        """Return the numbers of a pass that cost more than to be written down and read: sums as a whole."""
+        graph, depth = self._of, self._of.loops[number].depth
+        own = sorted(node for node in self._known[depth] if graph.op[node] not in ("carry", "load"))
+        readers: dict[int, list[int]] = {node: [] for node in own}
+        for node in own:
+            for argument in set(graph.args[node]):
+                if argument in readers:
+                    readers[argument].append(node)
+        costs, found = dict[int, int](), list[int]()
+        for node in own:
+            op, aux, size = graph.op[node], graph.aux[node], graph.size(node)
+            cost = aux[1] * size if op == "dot" else size if op in ("map", "pack") else op != "elem"
+            cost *= _COSTLY if (aux[0] if op == "map" else op) in _FUNCTIONS else 1
+            costs[node] = cost + sum(costs.get(argument, 0) for argument in set(graph.args[node]))
+            inside = len(readers[node]) == 1 and graph.op[readers[node][0]] in ("add", "sub", "neg")
+            if graph.type[node] == REAL and costs[node] > _WORTH * size and not inside and op in _KEPT:
+                found.append(node)
+                costs[node] = 0
+        return found
+
+    def _entries(self, node: int) -> list[int]:
+        array = self._at(node)
+        whole = self._of.op[node] in _ARRAYS
+        return [entry(self.graph, array, k) for k in range(self._of.size(node))] if whole else [array]
 
     def _write_out(self, number: int) -> int:
         old, new = self._of.loops[number], self.graph
