@@ -285,7 +285,7 @@ class Reverse:
         end = len(self._active)
         places = [k for k, one in enumerate(moving) if one]
         slopes = [graph.add("carry", (), REAL, (number, j), depth) for j in range(len(places))]
-        self._values = self._known_anyhow(self._step.held(self._step.kept[node], number), first, end)
+        self._values = self._step.held(self._step.kept[node], number, range(first, end))
         self._around, self._arrays_around = {}, {}
         for k, slope in zip(places, slopes, strict=True):
             self._give(after[k], slope)
@@ -322,16 +322,6 @@ class Reverse:
 
     def _value(self, node: int) -> int:
         return self._values.get(node, node)
-
-    def _known_anyhow(self, held: dict[int, int], first: int, end: int) -> dict[int, int]:
-        """Return what stands for numbers of a pass where some are read, and not computed again."""
-        graph, values = self._graph, dict(held)
-        for node in range(first, end):
-            args = graph.args[node]
-            if node not in values and not values.keys().isdisjoint(args):
-                given = [values.get(a, a) for a in args]
-                values[node] = graph.add(graph.op[node], given, graph.type[node], graph.aux[node])
-        return values
 
     def _factors(self, back: Loop, arrays: dict[int, list[int]]) -> list[tuple[int, list[list[Any]]]]:
         """Let a loop collect the factors of slopes by arrays outside of it: for each its place in that."""

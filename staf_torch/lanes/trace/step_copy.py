@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from ..emit.schedule import Sizes
 from .graph import NOW, REAL, ROW, STEP, Graph, Loop
@@ -123,8 +123,14 @@ class StepCopy:
         self._copy([*loop.following, *(node for part in loop.collected for node in part)])
         return [*map(self._at, loop.following)], [[*map(self._at, part)] for part in loop.collected]
 
-    def held(self, number: int, here: int) -> dict[int, int]:
-        """Return what a loop has kept of the numbers of a pass of ``here``, which takes them in reverse."""
+    def held(self, number: int, here: int, nodes: Iterable[int]) -> dict[int, int]:
+        """Return what stands for numbers of a pass that a loop has kept, or that follow from such.
+
+        Args:
+            number: of the loop in the step.
+            here: the loop that takes the passes in reverse.
+            nodes: of its pass.
+        """
         loop, before, known = self._of.loops[number], self._last[number], self._known
         found = dict[int, int]()
         for part, node in enumerate(self._held[number], len(loop.collected)):
@@ -133,6 +139,12 @@ class StepCopy:
             loads = [self.graph.add("load", (array,), REAL, (here, *p), STEP + 1) for p in places]
             whole = self._of.op[node] in _ARRAYS
             found[known[loop.depth][node]] = self.graph.add("pack", loads, REAL, size) if whole else loads[0]
+        graph = self.graph
+        for node in nodes:
+            args = graph.args[node]
+            if node not in found and not found.keys().isdisjoint(args):
+                given = [found.get(a, a) for a in args]
+                found[node] = graph.add(graph.op[node], given, graph.type[node], graph.aux[node])
         return found
 
     def _keep(self, number: int) -> int:
