@@ -144,22 +144,7 @@ def _run(
         errors=errors,
     )
     tell = _of_whole_problems(advance, len(starts), len(members))
-    share = 1 if starts.is_cpu else _ON_DEVICE
-    together = share * _ROWS
-    if starts.is_cpu:  # so few that a piece has as many times as a program needs to be worth while
-        together = min(together, max(_FEW, chunk_length(min(times, _TIMES), basis, starts.element_size())))
-    if any(member.sink is not None for member in members):
-        kept = starts.shape[1] + 3 + 2 * basis.count  # numbers of a row and time, of `HISTORY`
-        whole = _BYTES // (times * kept * starts.element_size())  # rows with all times
-        together = min(together, max(_FEW, whole))
-        whole = chunk_length(times, basis, starts.element_size())  # rows whose times are all in one piece
-        if starts.is_cpu and len(starts) > together and whole >= _FEW:
-            together = min(together, whole)
-    blocks = starts.split(together)
-    few = -(-min(together, len(starts)) // share)
-    chunk = chunk_length(few, basis, starts.element_size())
-    if len(blocks) < _SEEN:  # so many pieces of a long run show its progress; the results do not depend on it
-        chunk = max(1, min(chunk, max(_TIMES, -(-times // _SEEN))))
+    blocks, chunk = _pieces(starts, times, basis, kept=any(member.sink is not None for member in members))
     told = alone and len(blocks) == 1  # the engine warns of the reach, else each member of its own
     done, reach = 0, torch.zeros(len(starts), dtype=starts.dtype, device=starts.device)  # largest |x| nu(x)
     with torch.no_grad(), warnings.catch_warnings():
@@ -191,6 +176,33 @@ def _run(
         basis.warn_reach(float(reach.max()), stacklevel=2)
     found = zip(members, metrics.summaries(), reach.split([member.rows for member in members]), strict=True)
     return [member.outcome(summary, float(own.max()), alone=alone) for member, summary, own in found]
+
+
+def _pieces(starts: Tensor, times: int, basis: StaFBasis, *, kept: bool) -> tuple[Sequence[Tensor], int]:
+    """Return the initial states (B, n) in blocks that go through time together, and the times of a piece.
+
+    Args:
+        starts: of all rows.
+        times: of the chase.
+        basis: at every state.
+        kept: whether a history is.
+    """
+    share, size = 1 if starts.is_cpu else _ON_DEVICE, starts.element_size()
+    together = share * _ROWS
+    if starts.is_cpu:  # so few that a piece has as many times as a program needs to be worth while
+        together = min(together, max(_FEW, chunk_length(min(times, _TIMES), basis, size)))
+    if kept:
+        numbers = starts.shape[1] + 3 + 2 * basis.count  # of a row and time, of `HISTORY`
+        whole = _BYTES // (times * numbers * size)  # rows with all times
+        together = min(together, max(_FEW, whole))
+        whole = chunk_length(times, basis, size)  # rows whose times are all in one piece
+        if starts.is_cpu and len(starts) > together and whole >= _FEW:
+            together = min(together, whole)
+    blocks = starts.split(together)
+    chunk = chunk_length(-(-min(together, len(starts)) // share), basis, size)
+    if len(blocks) < _SEEN:  # so many pieces of a long run show its progress; the results do not depend on it
+        chunk = max(1, min(chunk, max(_TIMES, -(-times // _SEEN))))
+    return blocks, chunk
 
 
 def _reach(basis: StaFBasis, states: Tensor) -> Tensor:

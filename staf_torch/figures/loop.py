@@ -80,7 +80,7 @@ def draw_loop(picture: LoopPicture, width: object = None, font: object = None) -
         for name, entries in states:
             axes = next(left)
             values, beside = picture.state[:, thinned][..., entries], _of(other[0], entries)
-            _vector(axes, time, values, beside, "x", entries, many=len(picture.state_units) > 1)
+            _vector(axes, time, values, beside, _names("x", entries, picture.state_units))
             if picture.wanted is not None:
                 for k, entry in enumerate(entries):
                     line = picture.wanted[thinned, entry]
@@ -90,11 +90,11 @@ def draw_loop(picture: LoopPicture, width: object = None, font: object = None) -
         for name, entries in inputs:
             axes = next(left)
             values, beside = picture.control[:, thinned][..., entries], _of(other[1], entries)
-            _vector(axes, time, values, beside, "u", entries, many=len(picture.input_units) > 1, held=True)
+            _vector(axes, time, values, beside, _names("u", entries, picture.input_units), held=True)
             titles.append(bounds(axes, picture.low[entries], picture.high[entries]))
             axes.set_ylabel(name)
         axes = next(left)
-        _vector(axes, time, picture.cost[:, thinned, None], _column(other[2]), "J", [0])
+        _vector(axes, time, picture.cost[:, thinned, None], _column(other[2]), ["this loop"])
         axes.set_ylabel("cost so far")
         against_time(grid, time)
         letter(grid, *titles, "")
@@ -120,14 +120,17 @@ def _column(values: np.ndarray | None) -> np.ndarray | None:
     return None if values is None else values[..., None]
 
 
+def _names(letter: str, entries: Sequence[int], units: Sequence[str]) -> list[str]:
+    """Return the names of entries of a vector, with a number where it has several."""
+    return [f"${letter}_{{{entry + 1}}}$" if len(units) > 1 else f"${letter}$" for entry in entries]
+
+
 def _vector(
     axes: Axes,
     time: np.ndarray,
     values: np.ndarray,
     beside: np.ndarray | None,
-    letter: str,
-    entries: Sequence[int],
-    many: bool = False,
+    names: Sequence[str],
     held: bool = False,
 ) -> None:
     """Draw entries (R, T, k) of all rows, those of the other loop behind; as steps where they are held."""
@@ -137,11 +140,10 @@ def _vector(
         for row in beside:
             axes.plot(time, row, **broad)
         axes.get_lines()[-1].set_label("LQR")
-    for k, entry in enumerate(entries):
+    for k, name in enumerate(names):
         look = {"linestyle": dash(k), "color": colour(k), **steps}
         for row in values[1:, :, k]:
             axes.plot(time, row, linewidth=0.5, alpha=0.6, **look)
-        name = "this loop" if letter == "J" else f"${letter}_{{{entry + 1}}}$" if many else f"${letter}$"
         axes.plot(time, values[0, :, k], label=name, **look)
 
 

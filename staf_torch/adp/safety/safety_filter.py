@@ -163,43 +163,34 @@ class SafetyFilter(Controller):
         given = {"plant": plant, "constraints": constraints} if self.bounds.present else {}
         self.layers = gradients_of("SafetyFilter", **given)  # what brakes can do is a number
         with torch.no_grad():
-            self._design(policy, plant, constraints, dt, decay, degree, margin, weight)
-
-    def _design(
-        self,
-        policy: Policy | Controller,
-        plant: Plant,
-        constraints: Constraint | Sequence[Constraint],
-        dt: float,
-        decay: float | Sequence[float] | None,
-        degree: int | Sequence[int] | None,
-        margin: float | Sequence[float],
-        weight: Sequence[float] | None,
-    ) -> None:
-        self.controller = policy if isinstance(policy, Controller) else Feedback(policy)
-        self.plant, self.draws = plant, self.controller.draws
-        self.hold = positive_real("SafetyFilter", "dt", dt)
-        self.period = self.hold
-        self.constraints = listed("SafetyFilter", constraints, plant)
-        count = len(self.constraints)
-        self.conditions = Conditions(plant, self.constraints, self.bounds, self.hold, decay, degree, margin)
-        self.degree, self.moving = self.conditions.degree, self.conditions.moving
-        heavy = one_or_each("SafetyFilter", "weight", 1.0 if weight is None else weight, plant.inputs)
-        positive("SafetyFilter", "weight", heavy)
-        device = device_of(plant)
-        self.register_buffer("unit", heavy.rsqrt().to(device))
-        self.unit: Tensor  # (m,) of an input, in which distances are measured
-        self.register_buffer("table", cases(count, *sides_of(self.bounds)).to(device))
-        self.table: Tensor
-        self.ahead = LookAhead(self.conditions, self._policy)
-        if self.ahead.acts:
-            self.work = _FOLLOWING if self.ahead.by_policy else (1.0 if self.conditions.apart else _BRAKING)
-        self.follows, self.opposed = self.ahead.by_policy, self.ahead.opposed
-        self.kinds = nn.ModuleList()
-        away = {k: float(of_first(rate)) for k, rate in enumerate(self.ahead.against) if bool(rate > 0)}
-        if away:
-            which, rates = ", ".join(map(str, away)), ", ".join(f"{rate:.3g}" for rate in away.values())
-            _log.warning(_OPPOSED, which, _FOLLOWS if self.follows else _TOPPLES, which, rates)
+            self.controller = policy if isinstance(policy, Controller) else Feedback(policy)
+            self.plant, self.draws = plant, self.controller.draws
+            self.hold = positive_real("SafetyFilter", "dt", dt)
+            self.period = self.hold
+            self.constraints = listed("SafetyFilter", constraints, plant)
+            count = len(self.constraints)
+            self.conditions = Conditions(
+                plant, self.constraints, self.bounds, self.hold, decay, degree, margin
+            )
+            self.degree, self.moving = self.conditions.degree, self.conditions.moving
+            heavy = one_or_each("SafetyFilter", "weight", 1.0 if weight is None else weight, plant.inputs)
+            positive("SafetyFilter", "weight", heavy)
+            device = device_of(plant)
+            self.register_buffer("unit", heavy.rsqrt().to(device))
+            self.unit: Tensor  # (m,) of an input, in which distances are measured
+            self.register_buffer("table", cases(count, *sides_of(self.bounds)).to(device))
+            self.table: Tensor
+            self.ahead = LookAhead(self.conditions, self._policy)
+            if self.ahead.acts:
+                self.work = (
+                    _FOLLOWING if self.ahead.by_policy else (1.0 if self.conditions.apart else _BRAKING)
+                )
+            self.follows, self.opposed = self.ahead.by_policy, self.ahead.opposed
+            self.kinds = nn.ModuleList()
+            away = {k: float(of_first(rate)) for k, rate in enumerate(self.ahead.against) if bool(rate > 0)}
+            if away:
+                which, rates = ", ".join(map(str, away)), ", ".join(f"{rate:.3g}" for rate in away.values())
+                _log.warning(_OPPOSED, which, _FOLLOWS if self.follows else _TOPPLES, which, rates)
 
     @classmethod
     def of_kinds(cls, filters: Sequence[SafetyFilter], rows: Sequence[Tensor], count: int) -> SafetyFilter:
