@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import statistics
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -18,11 +19,12 @@ from ..lanes.row_decisions import numbers_of_rows
 from ..lanes.row_kinds import Kind, by_kind, of_kinds
 from ..lanes.row_numbers import all_rows
 from ..lanes.row_objects import refuse_rows
-from ..numerics.checks import integer, positive_real
+from ..numerics.checks import integer, one_or_each, positive
 from ..numerics.default_device import beside
 from ..numerics.shown import shown, sizes
 from ..signs import Sign
 from ..systems import Plant
+from ..systems.base import spread_of
 from .loop.controller import LQR, Controller, ControllerOfKinds, Feedback
 from .loop.simulation import simulate
 from .planning.global_value import GlobalValue
@@ -188,7 +190,7 @@ class NearOptimal(SampledRollout):
         self,
         *,
         states: int | None = None,
-        spread: float | None = None,
+        spread: float | Sequence[float] | None = None,
         full: bool = False,
         optimum: bool = False,
         seed: int = 0,
@@ -198,8 +200,8 @@ class NearOptimal(SampledRollout):
         Args:
             states: how many; by default 20, or fewer where loops are long (of 3, they end when the
                 slowest mode of the LQR has fallen to 1e-3, and not to 1e-4).
-            spread: half the width of their box, in units of the state, of angles at most pi; by default that
-                of `Reach.box`: the plant's ``spread``, and all angles.
+            spread: half the width of their box, in units of the state, one number or one a coordinate, of
+                angles at most pi; by default that of `Reach.box`: the plant's ``spread``, and all angles.
             full: whether to run ``controller()``, with its plans, to look for ``good_spread``, and to compile
                 the policy and time it: up to some minutes.
             optimum: whether to compare with direct shooting, where the plant allows it: from seconds for a
@@ -222,7 +224,9 @@ class NearOptimal(SampledRollout):
             because it was not asked for, and how to ask for it.
         """
         refuse_rows("NearOptimal.report", plant=self.plant, cost=self.cost)
-        width = positive_real("report", "spread", self.plant.spread if spread is None else spread)
+        stated = spread_of(self.plant, self.box) if spread is None else spread
+        width = positive("report", "spread", one_or_each("report", "spread", stated, len(self.box)))
+        several = not (isinstance(stated, int | float) or getattr(stated, "ndim", 1) == 0)
         count = self._few() if states is None else integer("report", "states", states, least=1)
         x0 = drawn(self.cost, self.box if spread is None else self._box(width), count, seed)
         stability = held_stability(self.control, self.plant, self.period, at=self.cost.target)
@@ -248,14 +252,18 @@ class NearOptimal(SampledRollout):
             "reach": self.reach.way,
             "spectral_radius": stability.spectral_radius,
             "largest_period": stability.largest_period,
-            "spread": width,
+            "spread": tuple(width.tolist()) if several else float(width[0]),
             "states": count,
             "regulated": float(fine.double().mean()),
             "over_base_median": _median(over_base),
             "over_base_max": float(over_base.max()) if len(over_base) else None,
             "over_optimum_median": _median(over_optimum),
             "over_optimum_max": float(over_optimum.max()) if len(over_optimum) else None,
-            "good_spread": good,
+            "good_spread": good
+            if good is None
+            else tuple((good * width).tolist())
+            if several
+            else good * float(width[0]),
             "microseconds": self._microseconds(x0[:1]) if full else None,
             "strained": strained,
             "left_out": self._left_out(full, optimum, bool(strained)),
@@ -275,12 +283,12 @@ class NearOptimal(SampledRollout):
             parts.append("over_optimum: report(optimum=True)")
         return "; ".join(parts)
 
-    def _box(self, width: float) -> Tensor:
-        box = torch.full_like(self.box, width)
-        box[list(self.plant.periodic)] = min(width, math.pi)
+    def _box(self, width: Tensor) -> Tensor:
+        box = width.to(self.box, copy=True)
+        box[list(self.plant.periodic)] = box[list(self.plant.periodic)].clamp(max=math.pi)
         return box
 
-    def _drawn(self, states: int, width: float, seed: int) -> Tensor:
+    def _drawn(self, states: int, width: Tensor, seed: int) -> Tensor:
         return drawn(self.cost, self._box(width), states, seed)
 
     def _run(self, controller: Controller, x0: Tensor, steps: int) -> tuple[Tensor, Tensor]:
@@ -294,15 +302,15 @@ class NearOptimal(SampledRollout):
         periods = int(settling(slowest(self.lqr, self.plant, self.cost, self.period), self.period))
         return periods if self.memory is None else max(periods, 2 * self.memory.library.control.shape[1])
 
-    def _good(self, fine: Tensor, states: int, width: float, seed: int) -> float:
-        """The largest box of `_SHARES` from which all states are regulated, ``fine``, else a smaller one."""
+    def _good(self, fine: Tensor, states: int, width: Tensor, seed: int) -> float:
+        """The largest of `_SHARES` of the box from which all states are regulated, ``fine``, else less."""
         shares: tuple[float, ...] = _SHARES
         if not fine.all(dim=1).any():  # where 1 is far, as a gap of a centimetre in metres
             shares = tuple(2.0**-k for k in range(3, 13))
             x0 = torch.cat([self._drawn(states, share * width, seed) for share in shares])
             fine = self._run(self.controller(), x0, self.settles)[1].view(-1, states)
         good = [share for share, kept in zip(shares, fine.all(dim=1).tolist(), strict=True) if kept]
-        return max(good, default=0.0) * width
+        return max(good, default=0.0)
 
     def _over_optimum(self, x0: Tensor, cost: Tensor, fine: Tensor) -> Tensor:
         if not self._has_optimum:

@@ -250,7 +250,7 @@ class StaFBasis(nn.Module, metaclass=Rowwise):
                 raise
             raise ValueError(
                 f"The target must take points of {centers.dtype}, in which this basis computes: write "
-                f"`net.double()`, or `lambda x: net(x.float())` for values of 7 digits; torch's error: {error}"
+                f"`net.double()`, or `lambda x: net(x.float())` for 7 digits; torch's error: {error}"
             ) from error
         values = sampled(target, found, centers, outputs)
         return values if outputs is None else values.movedim(-1, 0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import pkgutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from ..adp.loop.drawing import points_of_steps
 from ..adp.loop.step import ClosedLoop, LoopState
 from ..adp.problem.shapes import check_problem
 from ..lanes.gradients import refuse_gradient
-from ..numerics.checks import choice, fail, positive_real
+from ..numerics.checks import choice, fail, one_or_each, positive, positive_real
 from ..systems import Bounds, ControlAffineSystem, Plant
 
 NamedPlant = str | type[ControlAffineSystem] | ControlAffineSystem
@@ -90,8 +90,21 @@ def to_control(action: Numbers | Tensor, shape: tuple[int, ...], bounds: Bounds)
     return u
 
 
+def make_spread(call: str, plant: Plant, spread: float | Sequence[float] | Tensor | None) -> float | Numbers:
+    """Return half the width of the box of initial states: a number, or one a coordinate, (n,).
+
+    Raises:
+        ValueError: in the name of ``call``, if it is not positive, or not one a coordinate.
+    """
+    given = plant.spread if spread is None else spread
+    if isinstance(given, int | float):
+        return positive_real(call, "spread", given)
+    each = positive(call, "spread", one_or_each(call, "spread", given, plant.equilibrium().shape[0]))
+    return each.numpy()
+
+
 def start(
-    options: dict[str, Any] | None, generators: list[np.random.Generator], spread: float, dim: int
+    options: dict[str, Any] | None, generators: list[np.random.Generator], spread: float | Numbers, dim: int
 ) -> Tensor:
     """The initial states, (B, n): those of options["state"], or uniform in [-spread, spread]^n, a generator
     a row.

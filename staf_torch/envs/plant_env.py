@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -12,7 +13,7 @@ from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
 from ..adp import Cost
-from ..numerics.checks import integer, positive_real
+from ..numerics.checks import integer
 from .episodes import (
     NAMES,
     Episodes,
@@ -22,6 +23,7 @@ from .episodes import (
     make_cost,
     make_plant,
     make_spaces,
+    make_spread,
     start,
     to_control,
 )
@@ -67,7 +69,7 @@ class PlantEnv(gymnasium.Env):
         *,
         dt: float = 0.01,
         horizon: float = 10.0,
-        spread: float | None = None,
+        spread: float | Sequence[float] | None = None,
         bound: float | None = None,
         limit: float = 100.0,
         penalty: float = 1e4,
@@ -79,7 +81,7 @@ class PlantEnv(gymnasium.Env):
         self.episodes = Episodes(
             self.plant, self.cost, 1, dt=dt, horizon=horizon, limit=limit, penalty=penalty
         )
-        self.spread = positive_real("PlantEnv", "spread", self.plant.spread if spread is None else spread)
+        self.spread = make_spread("PlantEnv", self.plant, spread)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -137,7 +139,7 @@ class PlantVectorEnv(VectorEnv):
         num_envs: int = 1,
         dt: float = 0.01,
         horizon: float = 10.0,
-        spread: float | None = None,
+        spread: float | Sequence[float] | None = None,
         bound: float | None = None,
         limit: float = 100.0,
         penalty: float = 1e4,
@@ -155,9 +157,7 @@ class PlantVectorEnv(VectorEnv):
         self.episodes = Episodes(
             self.plant, self.cost, num_envs, dt=dt, horizon=horizon, limit=limit, penalty=penalty
         )
-        self.spread = positive_real(
-            "PlantVectorEnv", "spread", self.plant.spread if spread is None else spread
-        )
+        self.spread = make_spread("PlantVectorEnv", self.plant, spread)
         self._generators: list[np.random.Generator] = []
         self._over = torch.zeros(num_envs, dtype=torch.bool, device="cpu")
 

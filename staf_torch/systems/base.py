@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import abc
+from collections.abc import Sequence
 from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from ..lanes.row_decisions import in_any_row
-from ..lanes.row_numbers import value_of
+from ..lanes.row_numbers import RowNumbers, value_of
 from ..lanes.row_objects import OfRows
 from ..numerics.angles import wrap
 from ..numerics.checks import trailing
@@ -78,7 +79,8 @@ class Plant(nn.Module, metaclass=OfRows):
         dim: n, the number of states; None where the plant takes any.
         inputs: m, the number of inputs.
         units: of states and inputs, for figures, reports and the sheet of `staf-export`.
-        spread: episodes of `envs` begin uniformly in [-spread, spread]^n unless told otherwise.
+        spread: half the width of the box of usual states around the equilibrium, in units of the state: one
+            number, or one a coordinate, (n,). Episodes of `envs` begin in it unless told otherwise.
         periodic: coordinates that are angles in rad: x and x + 2 pi are the same state there. Costs, the LQR,
             metrics and plots take their differences in [-pi, pi].
         bounds: of the inputs; None for none. A cost that states no bounds of its own takes these.
@@ -95,7 +97,7 @@ class Plant(nn.Module, metaclass=OfRows):
     dim: int | None = None
     inputs: int = 0
     units: Units = Units()
-    spread: float = 1.0
+    spread: float | Sequence[float] | Tensor = 1.0
     periodic: tuple[int, ...] = ()
     bounds: Bounds | None = None
     period: float | None = None
@@ -175,6 +177,14 @@ class Plant(nn.Module, metaclass=OfRows):
         if self.dim is None:
             raise ValueError(f"`{type(self).__name__}.dim` must be the number of states; got None.")
         return self.dim
+
+
+def spread_of(plant: Plant, like: Tensor) -> float | Tensor:
+    """Return a plant's ``spread`` as a factor of states (..., n): a number, or (n,), one a coordinate."""
+    spread = plant.spread
+    if isinstance(spread, int | float | RowNumbers):
+        return spread
+    return torch.as_tensor(spread, dtype=torch.float64, device="cpu").to(like)
 
 
 class ControlAffineSystem(Plant):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ..lanes.row_numbers import RowNumbers
 from ..numerics.checks import fail
 from .base import Linearisation, Plant, Units
 from .user_plants import StepPlant
@@ -38,6 +39,9 @@ class Clocked(Plant):
         self.plant = plant
         self.dim, self.inputs, self.bounds = plant.dim + 1, plant.inputs, plant.bounds
         self.period, self.spread = plant.period, plant.spread
+        if not isinstance(self.spread, int | float | RowNumbers):  # the time has the largest
+            self.spread = [float(s) for s in self.spread]
+            self.spread += [max(self.spread)]
         states = [unit or "1" for unit in plant.units.of_states(plant.dim)]
         self.units = Units(", ".join([*states, "s"]), plant.units.input)
         self.periodic = tuple(sorted(index % plant.dim for index in plant.periodic))

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ...systems import Plant
+from ...systems.base import spread_of
 from ..problem.sampled import SampledProblem
 from .ddp import BoxDDP
 from .global_value import GlobalValue
@@ -23,7 +24,9 @@ _SEED = 7
 
 def box_of(plant: Plant, dim: int) -> Tensor:
     """Half the width of a plant's box: its ``spread``, and of its angles all of them: (n,)."""
-    width = torch.full((dim,), float(plant.spread), dtype=torch.float64, device="cpu")
+    width = torch.ones(dim, dtype=torch.float64, device="cpu")
+    spread = spread_of(plant, width)
+    width *= spread if isinstance(spread, Tensor) and spread.dim() else float(spread)
     width[list(plant.periodic)] = math.pi
     return width
 

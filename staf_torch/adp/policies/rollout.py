@@ -27,6 +27,7 @@ from ...numerics.default_device import beside, device_of
 from ...numerics.exponential_step import stalls
 from ...numerics.runge_kutta import runge_kutta_loop
 from ...systems import Barrier, ControlAffineSystem
+from ...systems.base import spread_of
 from ..loop.controller import LQR, Policy, Value
 from ..problem.cost import Cost
 from ..problem.shapes import check_objects, check_policy, check_problem, check_value
@@ -192,7 +193,11 @@ class RolloutPolicy(nn.Module, metaclass=Rowwise):
             2 * torch.rand(_SAMPLES, self.basis.dim, dtype=torch.float64, generator=generator, device="cpu")
             - 1
         )
-        x, error, steps = rest.double() + self.model.spread * away.to(rest.device), math.inf, self.steps
+        x, error, steps = (
+            rest.double() + spread_of(self.model, away) * away.to(rest.device),
+            math.inf,
+            self.steps,
+        )
         now = self.rollout(x, steps)
         while True:
             finer = self.rollout(x, 2 * steps)

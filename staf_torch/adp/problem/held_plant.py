@@ -31,6 +31,7 @@ from ...numerics.exponential_step import (
 from ...numerics.quantiles import known_quantile
 from ...numerics.runge_kutta import exponential, runge_kutta_loop, stage_weights
 from ...systems import Clocked, Plant, StepPlant
+from ...systems.base import spread_of
 from .cost import Cost, quadratic
 from .held_linear import periods
 
@@ -379,7 +380,9 @@ class Holding:
         generator = torch.Generator().manual_seed(0)
         x = torch.rand(_SAMPLES, len(rest), dtype=torch.float64, generator=generator, device="cpu")
         x = 2 * x.to(rest) - 1
-        x = rest + plant.spread * (x.abs() if isinstance(plant, Clocked) else x)
+        spread = spread_of(plant, rest)
+        most = spread if isinstance(spread, float | int) or spread.dim() == 0 else spread.amax()
+        x = rest + spread * (x.abs() if isinstance(plant, Clocked) else x)
         still = (
             plant.resting_input().double() if cost is None or cost.target_input is None else cost.target_input
         )
@@ -393,8 +396,8 @@ class Holding:
         for k in range(u.shape[-1]):  # as far as a loop may go in a period
             one = torch.eye(len(still), dtype=torch.float64, device=still.device)[k]
             pushed = plant.motion(x, u + one) - rate
-            push = known_quantile(pushed.abs().amax(-1).nan_to_num(0.0, 0.0), 0.5)
-            width = torch.where(push > 0, _MOVED * plant.spread / (self.dt * push), 1.0)
+            push = known_quantile((pushed.abs() * (most / spread)).amax(-1).nan_to_num(0.0, 0.0), 0.5)
+            width = torch.where(push > 0, _MOVED * most / (self.dt * push), 1.0)
             least = torch.maximum(low[k], still[k] - width)
             most = torch.minimum(high[k], still[k] + width)
             columns.append(least + (most - least) * chance[:, k])

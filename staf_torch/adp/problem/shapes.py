@@ -56,16 +56,21 @@ def check_plant(plant: Plant) -> None:
 
 
 def _check_spread(plant: Plant) -> None:
-    """Refuse a ``spread`` of a plant that is several numbers, as one a coordinate.
+    """Refuse a ``spread`` of a plant that is no positive number, and not one a coordinate.
 
     Raises:
         ValueError: that names it.
     """
     spread: object = plant.spread
-    if isinstance(spread, int | float | RowNumbers) or getattr(spread, "ndim", 1) == 0:
+    if isinstance(spread, int | float | RowNumbers):
         return
-    rule = "must be one number, for all coordinates: scale states of other sizes"
-    raise fail(type(plant).__name__, "spread", rule, spread)
+    rule = f"must be one positive number, or one a coordinate{f' ({plant.dim})' if plant.dim else ''}"
+    try:
+        each = torch.as_tensor(spread, dtype=torch.float64, device="cpu")
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise fail(type(plant).__name__, "spread", rule, spread) from error
+    if each.dim() > 1 or (each.dim() and len(each) != (plant.dim or len(each))) or not bool((each > 0).all()):
+        raise fail(type(plant).__name__, "spread", rule, spread)
 
 
 def check_cost(cost: Cost) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import math
 import time
@@ -248,3 +249,20 @@ def test_a_plant_without_a_drift_and_a_basis_that_is_none_are_refused() -> None:
         basis.ideal_weights(START, lambda y: net(y).squeeze(-1))
     with pytest.raises(ValueError, match=r"`simulate\(controller=...\)` must take states of torch.float64"):
         adp.simulate(net, PENDULUM, COST, START, dt=0.1, steps=1)
+
+
+def test_a_spread_is_one_number_or_one_a_coordinate() -> None:
+    def wheel(spread: object) -> systems.Linear:  # a position in km, a speed in m/s
+        plant = systems.Linear([[0.0, 1e-3], [0.0, 0.0]], [[0.0], [1.0]])
+        plant.spread = spread
+        return plant
+
+    cost = adp.QuadraticCost([[1e6, 0.0], [0.0, 1.0]], 1.0, dim=2, inputs=1)
+    near = functools.partial(adp.near_optimal, cost=cost, dt=0.05, reach="local", horizon=0.2)
+    for spread in ([2e-3, 5.0], torch.tensor([2e-3, 5.0], dtype=torch.float64), np.array([2e-3, 5.0])):
+        assert near(wheel(spread)).box.tolist() == [2e-3, 5.0]
+    assert near(wheel(0.5)).box.tolist() == [0.5, 0.5]
+    assert systems.Clocked(wheel((2e-3, 5.0))).spread == [2e-3, 5.0, 5.0]
+    for wrong in ([1.0, 2.0, 3.0], [1.0, -1.0], "wide", None, [1.0, math.nan]):
+        with pytest.raises(ValueError, match=r"`Linear\(spread=...\)` must be one positive number, or one"):
+            near(wheel(wrong))
