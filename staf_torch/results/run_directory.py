@@ -233,7 +233,7 @@ class HistoryWriter:
             for name, array in whole.items():
                 content = io.BytesIO()
                 np.lib.format.write_array(content, array, allow_pickle=False)
-                archive.writestr(f"{name}.npy", content.getbuffer())
+                archive.writestr(zipfile.ZipInfo(f"{name}.npy"), content.getbuffer())  # of no date
             archive.filelist += [member.info for member in self._members.values()]
         self._file.close()  # which may find the disk full
         os.replace(self._hidden, self._path)

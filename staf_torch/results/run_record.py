@@ -39,13 +39,21 @@ class RunRecord:
         choices: the option chosen of each group of settings.
         overrides: as typed.
         compiler: that makes machine code of the run, in its own words.
+        known: what `flat` returns of the settings, where that is known.
     """
 
     def __init__(
-        self, cfg: DictConfig, choices: Mapping[str, str | None], overrides: Sequence[str], compiler: str = ""
+        self,
+        cfg: DictConfig,
+        choices: Mapping[str, str | None],
+        overrides: Sequence[str],
+        compiler: str = "",
+        known: Mapping[str, Any] | None = None,
     ) -> None:
         self._start = time.monotonic()
-        settings = flat(cfg) | {g: c for g, c in choices.items() if not g.startswith("hydra/")}
+        settings = {**(flat(cfg) if known is None else known)} | {
+            g: c for g, c in choices.items() if not g.startswith("hydra/")
+        }
         self._about = {
             "version": __version__,
             "task": cfg.get("task"),

@@ -70,6 +70,17 @@ class ManySettings(Sequence[DictConfig]):
             found = self._made[index] = self._made.get(index) or self._hydras(found)
         return found
 
+    def plain(self, index: int) -> PlainSettings | None:
+        """Return those of a job where they are plain."""
+        found = self._settings[index]
+        return found if isinstance(found, PlainSettings) else None
+
+    def made(self, index: int) -> DictConfig:
+        """Return those of a job, which are plain, as OmegaConf has them: new ones at every call."""
+        found = self.plain(index)
+        assert found is not None
+        return self._hydras(found)
+
     def _hydras(self, settings: PlainSettings) -> DictConfig:
         """Return settings as OmegaConf has them, in a fifth of the time where they are like the first."""
         if self._first is None:

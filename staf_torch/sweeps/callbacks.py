@@ -178,6 +178,10 @@ class TrackRuns(Callback):
 
     on_multirun_start = on_run_start
 
+    def idle(self, settings: DictConfig) -> bool:
+        """Return whether no job of these settings is tracked."""
+        return OmegaConf.select(settings, "tracker._target_") is None
+
     def on_job_end(self, config: DictConfig, job_return: Any, **_: Any) -> None:
         """Hand over a run, or a job of a sweep, that has ended."""
         _track(config, "hydra.runtime.output_dir")

@@ -13,8 +13,6 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
-from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from ..experiments.registry import Metrics
@@ -27,7 +25,7 @@ from ..settings.chase import make_metrics, units_of
 from ..signs import Sign
 from . import lock
 from .batching import DEFERRED, USER_ERRORS, Outcome, completion, reason, sentence
-from .hydra_compat import as_typed
+from .hydra_compat import About
 
 _log = logging.getLogger(__name__)
 _BATCHED = "a sweep (staf -m) whose launcher is hydra/launcher=batched"
@@ -59,10 +57,9 @@ def execute(
     Raises:
         Exception: that of the experiment; the record has its reason.
     """
-    node: Any = HydraConfig.get()
-    directory = Path(node.runtime.output_dir)
-    choices = {str(group): choice for group, choice in node.runtime.choices.items()}
-    record = records.RunRecord(cfg, choices, as_typed(node.overrides.task), compiler())
+    about = About.now()
+    directory, choices = about.directory, about.choices
+    record = records.RunRecord(cfg, choices, about.overrides, compiler(), about.flat)
     try:
         if records.in_table(cfg):
             raise ValueError(f"`sweep.records=table` needs {_BATCHED}.")
@@ -70,7 +67,7 @@ def execute(
         if metrics is not None:
             _log.info("completed before: %s", os.path.relpath(directory))
         else:
-            if node.mode == RunMode.RUN and records.completed(directory) is not None:
+            if about.alone and records.completed(directory) is not None:
                 _log.info("replaces the run of the same command line in %s", os.path.relpath(directory))
             name = choices.get("experiment") or cfg.task
             with Sign(f"experiment {name}"), recorded(record, directory, seconds):
@@ -82,7 +79,7 @@ def execute(
                 _log.info("  pictures: %s (%s)", os.path.relpath(directory / FIGURES), ", ".join(pictures))
     except BaseException as error:
         refused = isinstance(error, USER_ERRORS)
-        if node.mode != RunMode.RUN:  # a job of a sweep keeps its log, and the sweep goes on
+        if not about.alone:  # a job of a sweep keeps its log, and the sweep goes on
             _log.error("%s", reason(error), exc_info=None if refused else error)
         elif refused:
             _take_back(directory)

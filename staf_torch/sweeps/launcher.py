@@ -25,7 +25,7 @@ from . import lock, table, workers
 from .batching import Flat, Outcome, reason
 from .clusters import executor
 from .executors import Executor, compute
-from .hydra_compat import JobReturn, JobStatus, SweepJobs, directory_of, without_hydra_overrides
+from .hydra_compat import Job, JobReturn, JobStatus, Plan, SweepJobs, without_hydra_overrides
 from .job import PRINTS, execute, objective, silence_terminal
 
 _log = logging.getLogger(__name__)
@@ -256,17 +256,18 @@ class Launch:
         self._jobs.refuse_shared(numbered)
         self._directory.mkdir(parents=True, exist_ok=True)
         records.list_jobs(self._directory, numbered)
-        returns = self._finished(numbered)
+        returns = self._finished(numbered, plan)
         progress = SweepProgress(len(numbered), len(returns))
         tasks = self._tasks(numbered, *plan, set(returns), progress)
         alike = AlikeFailures(list(numbered.values()), min(numbered, default=0))
         if returns:
             alike.ended(min(returns), None)
+        index = {num: i for i, num in enumerate(numbered)}
         with contextlib.closing(progress), contextlib.closing(tasks), _collecting_seldom():
             for num, task in tasks:
                 workers.check()
                 self._still_there(len(returns), len(numbered))
-                returns[num] = self._replay(num, numbered[num], task)
+                returns[num] = self._replay(task, self._jobs.job(num, numbered[num], plan, index[num]))
                 wrong = returns[num].status == JobStatus.FAILED
                 why = reason(returns[num]._return_value) if wrong else None
                 progress.ended(job_name(num, numbered[num]), why)
@@ -276,11 +277,10 @@ class Launch:
         _log.info("%d of %d jobs completed, %d failed", len(numbered) - failed, len(numbered), failed)
         return [returns[num] for num in numbered]
 
-    def _replay(self, num: int, overrides: list[str], task: Callable[[DictConfig], Any]) -> JobReturn:
+    def _replay(self, task: Callable[[DictConfig], Any], job: Job) -> JobReturn:
         """Run a job whose outcome is known as Hydra runs one, and keep no settings of it."""
-        config = self._jobs.whole(num, overrides)
-        self._directories[num] = directory_of(config)
-        ended = self._jobs.run(task, config, self._jobs.settings(overrides))
+        self._directories[job.num] = job.directory
+        ended = self._jobs.run(task, job)
         ended.cfg = ended.hydra_cfg = None
         return ended
 
@@ -305,14 +305,15 @@ class Launch:
                 sys.stderr.write(f"{name} failed: {error}\n")
                 ended.status, ended.return_value = JobStatus.FAILED, error
 
-    def _finished(self, numbered: Mapping[int, list[str]]) -> dict[int, JobReturn]:
+    def _finished(self, numbered: Mapping[int, list[str]], plan: Plan) -> dict[int, JobReturn]:
         """Return the jobs that an earlier start of this sweep completed."""
         found: dict[int, JobReturn] = {}
-        for num, overrides in numbered.items() if records.resumed(self._jobs.master) else ():
-            config = self._jobs.whole(num, overrides)
-            settings, choices = self._jobs.settings(overrides), config.hydra.runtime.choices
-            record = records.RunRecord(settings, choices, overrides, compiler())
-            metrics = record.finished_before(directory_of(config))
+        if not records.resumed(self._jobs.master):
+            return found
+        for index, (num, overrides) in enumerate(numbered.items()):
+            job = self._jobs.job(num, overrides, plan, index)
+            record = records.RunRecord(job.settings, job.prepared.choices, overrides, compiler(), job.flat)
+            metrics = record.finished_before(job.directory)
             if metrics is not None:
                 found[num] = JobReturn(overrides=overrides, status=JobStatus.COMPLETED)
                 found[num].return_value = objective(self._jobs.master, metrics)

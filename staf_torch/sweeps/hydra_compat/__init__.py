@@ -13,6 +13,9 @@ from .inside import config_loader as config_loader
 from .inside import everything_trusted as everything_trusted
 from .inside import trusted as trusted
 from .inside import trusted_packages as trusted_packages
+from .jobs import About as About
+from .jobs import Job as Job
+from .jobs import Plan as Plan
 from .jobs import SweepJobs as SweepJobs
 from .jobs import without_hydra_overrides as without_hydra_overrides
 from .program import VERSION as VERSION

@@ -10,7 +10,7 @@ import math
 import os
 import pickle
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -175,6 +175,18 @@ class Composer:
         """Return the configuration of these overrides with Hydra's node; all else as of a call."""
         lines = self._read(overrides)
         return self._noted(lines, lines)
+
+    def kind(self, overrides: Sequence[str]) -> tuple[Hashable, list[Override]]:
+        """Return what Hydra's node depends on but the texts of the others, and those overrides, parsed.
+
+        It is equal for jobs whose overrides differ in values of settings alone.
+        """
+        lines = self._read(overrides)
+        kept = tuple(str(line.override.input_line) for line in lines if not line.sets or line.of_hydra)
+        own = [line for line in lines if line.sets and not line.of_hydra]
+        others = [line for line in lines if not line.sets]
+        alone = not any(_overlap(one, other) for one in own for other in others)
+        return (kept if alone else tuple(overrides)), [line.override for line in lines if not line.of_hydra]
 
     def _noted(self, lines: Sequence[_Line], applied: Sequence[_Line]) -> DictConfig:
         """Compose some of the overrides, with Hydra's node, and note all of them there."""
@@ -358,9 +370,14 @@ def _note_overrides(node: Any, parsed: Sequence[Override]) -> None:
         return
     node.overrides.task = lines
     if not OmegaConf.is_interpolation(node.job, "override_dirname"):  # it is one in Hydra 1.4
-        style = node.job.config.override_dirname
-        named = sorted(str(one.input_line) for one in parsed if one.key_or_group not in style.exclude_keys)
-        node.job.override_dirname = style.item_sep.join(named).replace("=", style.kv_sep)
+        node.job.override_dirname = directory_name(node.job.config.override_dirname, parsed)
+
+
+def directory_name(style: Any, parsed: Sequence[Override]) -> str:
+    """Return overrides as the name of a directory, in a style of `hydra.job.config.override_dirname`."""
+    named = sorted(str(one.input_line) for one in parsed if one.key_or_group not in style["exclude_keys"])
+    joined: str = style["item_sep"].join(named)
+    return joined.replace("=", style["kv_sep"])
 
 
 def sweep_size(overrides: Sequence[Override]) -> float:

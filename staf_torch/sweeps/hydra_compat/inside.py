@@ -5,8 +5,10 @@ from __future__ import annotations
 import argparse
 import contextlib
 import inspect
+import logging.config
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from typing import Any
 
 import hydra
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
@@ -14,7 +16,9 @@ from hydra._internal.utils import create_config_search_path, get_args_parser
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.config_search_path import SearchPathQuery
 from hydra.core.plugins import Plugins
+from hydra.core.utils import configure_log
 from hydra.errors import SearchPathException
+from omegaconf import OmegaConf
 
 from ...settings import config_directory
 
@@ -24,6 +28,17 @@ if HAS_WHITELIST:
     import hydra._internal.execution_policy as execution_policy
 
 TRUSTED = ("staf_torch.*",)
+_configure: Callable[[dict[str, Any]], None] = logging.config.dictConfig
+with contextlib.suppress(ImportError):  # of the latest versions
+    from hydra._internal.logging_config import configure_logging as _configure
+
+
+def configure_logging(log: dict[str, Any] | None, verbose: Any) -> None:
+    """Set up logging as `hydra.core.utils.configure_log` does, from settings that are plain and resolved."""
+    if log is None or verbose is not False:
+        configure_log(None if log is None else OmegaConf.create(log), verbose)
+    elif log["root"] is not None:
+        _configure(log)
 
 
 def arguments(argv: Iterable[str]) -> argparse.Namespace:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import functools
 import logging
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
-import yaml
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.utils import (
@@ -24,13 +24,17 @@ from hydra.core.utils import (
     run_job,
     setup_globals,
 )
-from hydra.types import HydraContext
+from hydra.experimental.callback import Callback
+from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
-from omegaconf._utils import OmegaConfDumper
 
 from ...settings.plain import ManySettings
 from .composing import Composer, as_typed, directory_of, parse_override, take_directory
-from .inside import HAS_WHITELIST
+from .inside import HAS_WHITELIST, configure_logging
+from .prepared import Prepared, Texts, absolute
+
+Plan = tuple[ManySettings, Sequence[Mapping[str, Any]]]
+"""The settings of many jobs, and the same by dotted keys."""
 
 
 class SweepJobs:
@@ -45,6 +49,8 @@ class SweepJobs:
         node = master.hydra
         self.master, self._context, self._loader = master, context, context.config_loader
         self._always = as_typed(node.overrides.hydra)
+        self._leaders: dict[Hashable, Prepared] = {}  # of each kind of job
+        self._texts = Texts()
         self._composer = (
             self._loader
             if isinstance(self._loader, Composer)
@@ -95,6 +101,7 @@ class SweepJobs:
         with read_write(config.hydra), open_dict(config.hydra):
             config.hydra.job.id = str(num)
             config.hydra.job.num = num
+            config.hydra.runtime.output_dir = absolute(directory_of(config))
         return config
 
     def _at_the_same_time(self, config: DictConfig) -> DictConfig:
@@ -108,11 +115,35 @@ class SweepJobs:
         sweeper = self.master.hydra.sweeper
         return self.choices.get("hydra/sweeper") == "basic" and sweeper.get("max_batch_size") is None
 
+    def job(self, num: int, overrides: Sequence[str], plan: Plan | None = None, index: int = 0) -> Job:
+        """Return job ``num``.
+
+        Args:
+            num: of the job.
+            overrides: of the job.
+            plan: what `many` returned, of this job among others.
+            index: of the job there.
+        """
+        plain, flat = (None, None) if plan is None else (plan[0].plain(index), plan[1][index])
+        settings = self.settings if plain is None else lambda _: plan[0].made(index)  # type: ignore[index]
+        return Job(self, num, overrides, settings, plain, flat)
+
     def directory(self, num: int, overrides: Sequence[str]) -> Path:
         """Return the run directory of job ``num``: its number, where nobody says otherwise."""
         if self._numbered([overrides]):
-            return Path(str(self.master.hydra.sweep.dir), str(num))
+            return self._folder / str(num)
         return directory_of(self.whole(num, overrides))
+
+    def prepared(self, num: int, overrides: Sequence[str]) -> Prepared:
+        """Return what Hydra's node of job ``num`` says, from another job of its kind where there is one."""
+        kind, parsed = self._composer.kind([*self._always, *overrides])
+        leader = self._leaders.get(kind) if self._numbered([overrides]) else None
+        if leader is None:
+            leader = Prepared.of(self.whole(num, overrides))
+            if leader.leads:
+                self._leaders[kind] = leader
+            return leader
+        return leader.followed(num, parsed, absolute(self._folder / str(num)))
 
     def refuse_shared(self, numbered: Mapping[int, Sequence[str]]) -> None:
         """Raise ValueError if two jobs have one directory."""
@@ -123,9 +154,18 @@ class SweepJobs:
 
     def _numbered(self, jobs: Iterable[Sequence[str]]) -> bool:
         """Return whether the directories of these jobs are their numbers."""
-        sweep: Any = OmegaConf.to_container(self.master.hydra.sweep)
         own = any(line.lstrip("+~").startswith("hydra") for job in jobs for line in job)
-        return not own and sweep["subdir"] == "${hydra.job.num}"
+        return not own and self._by_number
+
+    @functools.cached_property
+    def _by_number(self) -> bool:
+        sweep: Any = OmegaConf.to_container(self.master.hydra.sweep)
+        return bool(sweep["subdir"] == "${hydra.job.num}")
+
+    @functools.cached_property
+    def _folder(self) -> Path:
+        """The directory of the sweep."""
+        return Path(str(self.master.hydra.sweep.dir))
 
     def start(self) -> None:
         """Register Hydra's resolvers and send the log to the sweep's own handlers."""
@@ -135,79 +175,146 @@ class SweepJobs:
             trust = {"execution_whitelist": cast(Any, self._context).execution_whitelist}
         configure_log(self.master.hydra.hydra_logging, self.master.hydra.verbose, **trust)
 
-    def run(self, task: Callable[[DictConfig], Any], config: DictConfig, settings: DictConfig) -> JobReturn:
-        """Run one job as every launcher does: directory, `.hydra/`, log, callbacks and status.
-
-        Args:
-            task: is called with ``settings``.
-            config: of the job, with Hydra's node.
-            settings: of the job, without.
-        """
+    def run(self, task: Callable[[DictConfig], Any], job: Job) -> JobReturn:
+        """Run one job as every launcher does: directory, `.hydra/`, log, callbacks and status."""
         with handlers_aside():  # what comes after belongs to no job's log
-            if not HAS_WHITELIST and not config.hydra.job.chdir:
-                return _run_job(self._context.callbacks, task, config, settings)
-            return run_job(task, config, "hydra.sweep.dir", "hydra.sweep.subdir", self._context)
+            if HAS_WHITELIST or job.prepared.node["job"]["chdir"]:
+                return run_job(task, job.config, "hydra.sweep.dir", "hydra.sweep.subdir", self._context)
+            active, before = HydraConfig.instance(), HydraConfig.instance().cfg
+            active.cfg = cast(Any, job)
+            try:
+                return self._run(task, job)
+            finally:
+                active.cfg = before
 
-
-def _run_job(
-    callbacks: Any, task: Callable[[DictConfig], Any], config: DictConfig, settings: DictConfig
-) -> JobReturn:
-    """Run one job as `run_job` of Hydra 1.3 does, without its five copies of the settings.
-
-    Args:
-        callbacks: of the sweep.
-        task: is called with ``settings``.
-        config: of the job, with Hydra's node.
-        settings: of the job, without.
-    """
-    active, before = HydraConfig.instance(), HydraConfig.instance().cfg
-    OmegaConf.set_readonly(config.hydra, True)
-    active.cfg = cast(Any, config)
-    try:
-        directory = directory_of(config).absolute()
-        with read_write(config.hydra.runtime), open_dict(config.hydra.runtime):
-            config.hydra.runtime.output_dir = os.path.normpath(directory)
+    def _run(self, task: Callable[[DictConfig], Any], job: Job) -> JobReturn:
+        """Run one job as `run_job` of Hydra 1.3 does, without its five copies of the settings."""
+        about, callbacks = job.prepared, self._context.callbacks
+        heard = _listen(callbacks, job.settings)
         ret = JobReturn(
-            overrides=as_typed(config.hydra.overrides.task),
-            cfg=settings,
-            hydra_cfg=config,
+            overrides=about.overrides,
+            cfg=job.settings,
+            hydra_cfg=job.config if heard else None,
             working_dir=os.getcwd(),
             task_name=JobRuntime.instance().get("name"),
         )
-        directory.mkdir(parents=True, exist_ok=True)
-        configure_log(config.hydra.job_logging, config.hydra.verbose)
-        if config.hydra.output_subdir is not None:
-            folder = directory / config.hydra.output_subdir
+        os.makedirs(about.directory, exist_ok=True)
+        configure_logging(copy.deepcopy(about.log), about.verbose)
+        if about.folder is not None:
+            folder = Path(about.directory, about.folder)
             folder.mkdir(exist_ok=True)
-            node = OmegaConf.to_container(config.hydra, enum_to_str=True)
-            files = {"config": OmegaConf.to_container(settings, enum_to_str=True), "hydra": {"hydra": node}}
-            for name, content in (files | {"overrides": ret.overrides}).items():
-                (folder / f"{name}.yaml").write_text(_yaml(content), encoding="utf-8")
-        with env_override(config.hydra.job.env_set):
-            callbacks.on_job_start(config=config, task_function=task)
+            for name, text in job.texts(self._texts).items():
+                (folder / f"{name}.yaml").write_text(text, encoding="utf-8")
+        with env_override(dict(about.env)):
+            if heard:
+                callbacks.on_job_start(config=job.config, task_function=task)
             try:
-                ret.return_value = task(settings)
+                ret.return_value = task(job.settings)
                 ret.status = JobStatus.COMPLETED
             except Exception as error:
                 ret.return_value, ret.status = error, JobStatus.FAILED
         _flush_loggers()
-        callbacks.on_job_end(config=config, job_return=ret)
+        if heard:
+            callbacks.on_job_end(config=job.config, job_return=ret)
         return ret
-    finally:
-        active.cfg = before
 
 
-def _yaml(content: Any) -> str:
-    """Return plain values as OmegaConf writes them, emitted in C where that is built: a tenth of the time."""
-    base: Any = getattr(yaml, "CDumper", yaml.Dumper)
-    return cast(str, yaml.dump(content, Dumper=_dumper(base), allow_unicode=True, sort_keys=False))
+class Job:
+    """A job of a sweep; its configuration with Hydra's node is composed where somebody asks for it.
+
+    While it runs `HydraConfig.get()` returns its node.
+
+    Args:
+        jobs: all of the sweep.
+        num: of the job.
+        overrides: of the job.
+        settings: composes the settings by the overrides.
+        plain: the settings as a tree, where they are known so.
+        flat: the same by dotted keys.
+    """
+
+    def __init__(
+        self,
+        jobs: SweepJobs,
+        num: int,
+        overrides: Sequence[str],
+        settings: Callable[[Sequence[str]], DictConfig],
+        plain: Mapping[str, Any] | None,
+        flat: Mapping[str, Any] | None,
+    ) -> None:
+        self._jobs, self.num, self.overrides = jobs, num, overrides
+        self._settings, self._plain, self.flat = settings, plain, flat
+
+    @functools.cached_property
+    def prepared(self) -> Prepared:
+        """What Hydra's node says."""
+        return self._jobs.prepared(self.num, self.overrides)
+
+    @functools.cached_property
+    def directory(self) -> Path:
+        """The run directory."""
+        return self._jobs.directory(self.num, self.overrides)
+
+    @functools.cached_property
+    def settings(self) -> DictConfig:
+        """The settings as the task sees them, its own to change."""
+        return self._settings(self.overrides)
+
+    @functools.cached_property
+    def config(self) -> DictConfig:
+        """The configuration with Hydra's node, which is read alone."""
+        config = self._jobs.whole(self.num, self.overrides)
+        OmegaConf.set_readonly(config.hydra, True)
+        return config
+
+    @property
+    def hydra(self) -> Any:
+        """Hydra's node."""
+        return self.config.hydra
+
+    def texts(self, texts: Texts) -> dict[str, str]:
+        """Return the files of `.hydra/`, by name, as Hydra writes them."""
+        written = self._plain
+        if written is None:
+            written = cast(dict[str, Any], OmegaConf.to_container(self.settings, enum_to_str=True))
+        return {
+            "config": texts.mapping(written),
+            "hydra": texts.mapping({"hydra": self.prepared.node}),
+            "overrides": texts.lines(self.prepared.overrides),
+        }
 
 
-@functools.cache
-def _dumper(base: Any) -> Any:
-    kind: Any = type("_Dumper", (base,), {})
-    kind.add_representer(str, OmegaConfDumper.str_representer)
-    return kind
+class About(NamedTuple):
+    """The job that runs, in the words of Hydra."""
+
+    directory: Path
+    choices: Mapping[str, str | None]  # the option of each group
+    overrides: list[str]  # as typed
+    alone: bool  # whether it is no job of a sweep
+    flat: Mapping[str, Any] | None = None  # its settings by dotted keys, where they are known
+
+    @classmethod
+    def now(cls) -> About:
+        """Return the job that Hydra runs now."""
+        active: Any = HydraConfig.instance().cfg
+        if isinstance(active, Job):
+            known = active.prepared
+            return cls(Path(known.directory), known.choices, known.overrides, False, active.flat)
+        node: Any = HydraConfig.get()
+        choices = {str(group): choice for group, choice in node.runtime.choices.items()}
+        overrides = as_typed(node.overrides.task)
+        return cls(Path(node.runtime.output_dir), choices, overrides, node.mode == RunMode.RUN)
+
+
+def _listen(callbacks: Any, settings: DictConfig) -> bool:
+    """Return whether a callback wants to know of a job: those of Hydra's base class do nothing."""
+    for each in callbacks.callbacks:
+        kind, idle = type(each), getattr(each, "idle", None)
+        if idle is not None and idle(settings):
+            continue
+        if (kind.on_job_start, kind.on_job_end) != (Callback.on_job_start, Callback.on_job_end):
+            return True
+    return False
 
 
 def without_hydra_overrides(overrides: Sequence[str]) -> list[str]:
