@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import gc
 import importlib
 import re
 import string
@@ -57,8 +58,11 @@ def main() -> None:
             return
     except Exception:  # what a user got wrong, in the words of the command that runs something
         pass
+    gc.disable()  # what torch makes while it is loaded stays: searches for garbage there are a fifth of the time
     with Sign("loading torch", log=False):
         running = importlib.import_module("staf_torch.cli.running")
+    gc.freeze()
+    gc.enable()
     running.main()
 
 

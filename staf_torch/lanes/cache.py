@@ -313,11 +313,12 @@ def prune(folder: Path, *, now: float | None = None, largest: int = LARGEST) -> 
     """
     now = time.time() if now is None else now
     found = list[tuple[float, int, Path]]()
-    for path in folder.iterdir():
-        with contextlib.suppress(OSError):  # deleted by another process
-            state = path.stat()
-            if path.suffix in (".so", ".cubin") or path.name.startswith(("trace-", _SCRATCH)):
-                found.append((state.st_mtime, state.st_size, path))
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            if entry.name.endswith((".so", ".cubin")) or entry.name.startswith(("trace-", _SCRATCH)):
+                with contextlib.suppress(OSError):  # deleted by another process
+                    state = entry.stat()
+                    found.append((state.st_mtime, state.st_size, Path(entry.path)))
     kept = sum(size for _, size, _ in found)
     for last_use, size, path in sorted(found):
         unused = now - last_use
