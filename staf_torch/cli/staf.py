@@ -58,7 +58,7 @@ def main() -> None:
             return
     except Exception:  # what a user got wrong, in the words of the command that runs something
         pass
-    gc.disable()  # what torch makes while it is loaded stays: searches for garbage there are a fifth of the time
+    gc.disable()  # what torch makes stays: searches for garbage are a fifth of the time to load it
     with Sign("loading torch", log=False):
         running = importlib.import_module("staf_torch.cli.running")
     gc.freeze()

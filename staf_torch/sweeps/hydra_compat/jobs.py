@@ -29,9 +29,9 @@ from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 from ...settings.plain import ManySettings
+from .alike import NodeOfJob, Texts, absolute
 from .composing import Composer, as_typed, directory_of, parse_override, take_directory
 from .inside import HAS_WHITELIST, configure_logging
-from .prepared import Prepared, Texts, absolute
 
 Plan = tuple[ManySettings, Sequence[Mapping[str, Any]]]
 """The settings of many jobs, and the same by dotted keys."""
@@ -49,7 +49,7 @@ class SweepJobs:
         node = master.hydra
         self.master, self._context, self._loader = master, context, context.config_loader
         self._always = as_typed(node.overrides.hydra)
-        self._leaders: dict[Hashable, Prepared] = {}  # of each kind of job
+        self._leaders: dict[Hashable, NodeOfJob] = {}  # of each kind of job
         self._texts = Texts()
         self._composer = (
             self._loader
@@ -134,12 +134,12 @@ class SweepJobs:
             return self._folder / str(num)
         return directory_of(self.whole(num, overrides))
 
-    def prepared(self, num: int, overrides: Sequence[str]) -> Prepared:
+    def prepared(self, num: int, overrides: Sequence[str]) -> NodeOfJob:
         """Return what Hydra's node of job ``num`` says, from another job of its kind where there is one."""
         kind, parsed = self._composer.kind([*self._always, *overrides])
         leader = self._leaders.get(kind) if self._numbered([overrides]) else None
         if leader is None:
-            leader = Prepared.of(self.whole(num, overrides))
+            leader = NodeOfJob.of(self.whole(num, overrides))
             if leader.leads:
                 self._leaders[kind] = leader
             return leader
@@ -246,7 +246,7 @@ class Job:
         self._settings, self._plain, self.flat = settings, plain, flat
 
     @functools.cached_property
-    def prepared(self) -> Prepared:
+    def prepared(self) -> NodeOfJob:
         """What Hydra's node says."""
         return self._jobs.prepared(self.num, self.overrides)
 

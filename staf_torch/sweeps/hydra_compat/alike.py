@@ -24,7 +24,7 @@ _KNOWN = ("hydra.runtime.output_dir", "hydra.job.name")  # what a log may refer 
 _MOST = 1000  # entries of YAML that are kept
 
 
-class Prepared(NamedTuple):
+class NodeOfJob(NamedTuple):
     """What Hydra's node of a job says."""
 
     directory: str  # absolute
@@ -37,7 +37,7 @@ class Prepared(NamedTuple):
     overrides: list[str]
 
     @classmethod
-    def of(cls, config: DictConfig) -> Prepared:
+    def of(cls, config: DictConfig) -> NodeOfJob:
         """Read it in a configuration with Hydra's node."""
         node: Any = config.hydra
         log = node.job_logging
@@ -59,7 +59,7 @@ class Prepared(NamedTuple):
         own = str((self.node["job"]["name"], self.node["job"]["env_set"], self.node["output_subdir"]))
         return set(refers) <= set(_KNOWN) and "${" not in own
 
-    def followed(self, num: int, parsed: Sequence[Override], directory: str) -> Prepared:
+    def followed(self, num: int, parsed: Sequence[Override], directory: str) -> NodeOfJob:
         """Return that of job ``num``, which differs in these overrides and in its directory alone."""
         node, job = dict(self.node), dict(self.node["job"])
         lines = [str(one.input_line) for one in parsed]
