@@ -34,7 +34,7 @@ from .batching import (
     solve,
 )
 from .hydra_compat import env_override, trusted, trusted_packages
-from .workers import LostError, Worker, ready
+from .workers import LostError, Worker, give_memory_back, ready
 
 _log = logging.getLogger(__name__)
 _MOST = 300  # characters of what is said of a lost worker
@@ -194,7 +194,9 @@ class Inline(Executor):
 
     def submit(self, batch: Batch, progress: Progress) -> Done:
         start = time.monotonic()
-        return Done(solve(batch.settings, progress), time.monotonic() - start)
+        outcomes = solve(batch.settings, progress)
+        give_memory_back()
+        return Done(outcomes, time.monotonic() - start)
 
     def wait(self, handles: dict[int, Done]) -> list[int]:
         return list(handles)
@@ -266,6 +268,7 @@ def solve_elsewhere(pickled: bytes, path: Sequence[str], packages: Sequence[str]
             elif isinstance(outcome, Computed) and batch.measured:
                 outcomes[i] = Written(outcome.metrics, ())
         portable = [_portable(outcome) for outcome in outcomes]
+    give_memory_back()
     return pickle.dumps(Done(portable, time.monotonic() - start))
 
 

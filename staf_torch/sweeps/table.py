@@ -93,7 +93,7 @@ def fill(
     keep = "history" in jobs.fixed and jobs.base.history is True
     fixed = ("figures=false", f"history={str(keep).lower()}")
     piece = max(_PIECE, most or 0) * min(_AHEAD, executor.workers)
-    shared, done, lost = jobs.fixed, len(before.made), 0
+    shared, done = jobs.fixed, len(before.made)
 
     def composed(begin: int) -> tuple[ManySettings, list[Mapping[str, Any]]]:
         return jobs.many([[*job, *fixed] for job in overrides[begin : begin + piece]])
@@ -105,6 +105,35 @@ def fill(
     for begin in range(0, done, piece):
         _, flat = composed(begin) if begin else first
         _refuse_others(overrides, begin, flat, before.made[begin : begin + piece])
+    ready = [first] if done < piece else []
+    del first
+
+    def computed(begin: int, write: Write, completed: list[int]) -> int:
+        """Compute the jobs of a piece and write their rows; return how many lost their workers."""
+        cfgs, flat = ready.pop() if ready else composed(begin)
+        rows, lost = _InOrder(write, [made_by(one) for one in flat], max(0, done - begin)), 0
+
+        def place(index: int) -> Path:
+            return directory / FOLDER / str(begin + index)
+
+        for index, outcome, _ in compute(
+            *(cfgs, flat, place, executor),
+            finished=range(rows.written),
+            most=most,
+            measured=not keep,
+            tell=lambda count: tell(begin + count),
+        ):
+            workers.check()
+            own = [line for line in overrides[begin + index] if line.partition("=")[0] not in shared]
+            row = {"num": begin + index, "overrides": own}
+            row |= _result(cfgs, index, outcome, place(index), keep)
+            gone = isinstance(outcome, Failed) and isinstance(outcome.error, LostError)
+            lost += gone
+            rows.add(index, row, gone)
+            completed[0] = begin + rows.written
+            ended(begin + index, row["reason"])
+        return lost
+
     with (
         _saying_how_to_resume(directory, len(overrides)) as completed,
         recorded(record, directory, 0.0),
@@ -115,32 +144,9 @@ def fill(
         record.measured_in(units_of(jobs.base))
         for row in _rows(directory / partial_name(ROWS), done):
             ended(row["num"], row["reason"])
-        for begin in range(done // piece * piece, len(overrides), piece):
-            cfgs, flat = composed(begin) if begin else first
-            rows = _InOrder(write, [made_by(one) for one in flat], max(0, done - begin))
-
-            def place(index: int, begin: int = begin) -> Path:
-                return directory / FOLDER / str(begin + index)
-
-            def told(count: float, begin: int = begin) -> None:
-                tell(begin + count)
-
-            for index, outcome, _ in compute(
-                *(cfgs, flat, place, executor),
-                finished=range(rows.written),
-                most=most,
-                measured=not keep,
-                tell=told,
-            ):
-                workers.check()
-                own = [line for line in overrides[begin + index] if line.partition("=")[0] not in shared]
-                row = {"num": begin + index, "overrides": own}
-                row |= _result(cfgs, index, outcome, place(index), keep)
-                gone = isinstance(outcome, Failed) and isinstance(outcome.error, LostError)
-                lost += gone
-                rows.add(index, row, gone)
-                completed[0] = begin + rows.written
-                ended(begin + index, row["reason"])
+        lost = sum(
+            computed(begin, write, completed) for begin in range(done // piece * piece, len(overrides), piece)
+        )
         if lost:
             raise LostError(f"{lost} of {len(overrides)} rows lost their workers; sweep.resume computes them")
 
