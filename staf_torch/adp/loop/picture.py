@@ -15,7 +15,7 @@ from ...lanes.row_numbers import some_rows
 from ...numerics.angles import wrap
 from ...numerics.checks import fail
 from ...results.pictures import LoopPicture
-from ...systems import Clocked, Plant, Units
+from ...systems import Bounds, Clocked, Plant, Units
 from ..problem.cost import Cost
 from .controller import LQR, Controller, Feedback
 
@@ -56,17 +56,18 @@ class LoopAbout:
         Args:
             controller: as in `simulate`.
             system: likewise.
-            cost: around the plant.
+            cost: around the plant; its bounds are drawn where the controller was made with none.
             period: for which a control is held, s; None where it follows the state.
             run: the loop of another controller, from other states.
         """
-        bounds, clock = cost.bounds, isinstance(system, Clocked)
+        bounds, clock = _bounds(controller) or cost.bounds, isinstance(system, Clocked)
         low, high = (None, None) if bounds is None else (bounds.low, bounds.high)
         itself = isinstance(controller, Feedback) and isinstance(controller.policy, LQR)
         plant = type(system.plant if isinstance(system, Clocked) else system).__name__
 
         def of_rows(x0: Tensor, rows: Tensor) -> LoopResult:
-            lqr = Feedback(LQR(system, cost, period))  # of all rows, where they have plants of their own
+            within = cost if low is None else cost.bounded(low, high)
+            lqr = Feedback(LQR(system, within, period))  # of all rows, where they have plants of their own
             with some_rows(rows):
                 return run(lqr, x0)
 
@@ -76,6 +77,16 @@ class LoopAbout:
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "cost": None, "beside": None}
+
+
+def _bounds(holder: object, depth: int = 3) -> Bounds | None:
+    """Return the bounds of the inputs that a controller was made with, or what it is made of; None for none."""
+    bounds = getattr(holder, "bounds", None)
+    if isinstance(bounds, Bounds) and bounds.present:
+        return bounds
+    parts = (getattr(holder, name, None) for name in ("policy", "controller", "problem", "cost") if depth)
+    found = (_bounds(part, depth - 1) for part in parts if part is not None)
+    return next((each for each in found if each is not None), None)
 
 
 def summary(result: LoopResult) -> str:
