@@ -63,16 +63,6 @@ class Bounds:
         """Return whether u is admissible: (..., m) -> (...) bool."""
         return ((u >= self.low.to(u)) & (u <= self.high.to(u))).all(-1)
 
-    def inward(self, u: Tensor, slope: Tensor) -> Tensor:
-        """The projected gradient at an admissible u: the slope, 0 where it points out of the box at a bound.
-
-        Args:
-            u: (..., m).
-            slope: derivative of a cost in u, (..., m).
-        """
-        at_low, at_high = u <= self.low.to(u), u >= self.high.to(u)
-        return torch.where((at_low & (slope > 0)) | (at_high & (slope < 0)), 0.0, slope)
-
     def measured_from(self, u: Tensor) -> Bounds:
         """The box of u' - u for every admissible u': the bounds of a deviation from u (m,)."""
         there = self.on(u.device)

@@ -115,14 +115,13 @@ def check_within(call: str, argument: str, bounds: Bounds | None, u: Tensor) -> 
     return True
 
 
-def regulated(call: str, plant: Plant, cost: Cost, argument: str = "cost") -> Cost:
+def regulated(call: str, plant: Plant, cost: Cost) -> Cost:
     """Return the cost around the plant, of a door that regulates: the plant rests within the bounds.
 
     Args:
         call: the door.
         plant: the plant.
         cost: the cost rate.
-        argument: of the door, which is named where an input is out of bounds.
 
     Raises:
         ValueError: if the sizes differ, the plant does not rest at the set-point, or its input is not within
@@ -130,7 +129,7 @@ def regulated(call: str, plant: Plant, cost: Cost, argument: str = "cost") -> Co
     """
     check_problem(plant, cost)
     placed = cost.around(plant)
-    _check_held(call, plant, placed, argument)
+    _check_held(call, plant, placed)
     return placed
 
 
@@ -174,7 +173,7 @@ def restless(plant: Plant, cost: Cost) -> str:
     """
     try:
         check_regulates("restless", plant, cost)
-        _check_held("restless", plant, cost, "cost")
+        _check_held("restless", plant, cost)
     except ValueError as error:
         return str(error)
     return ""
@@ -193,18 +192,18 @@ def warn_if_restless(call: str, plant: Plant, cost: Cost) -> bool:
     except ValueError:
         return True
     try:
-        return _check_held(call, plant, cost, "cost")
+        return _check_held(call, plant, cost)
     except ValueError as error:
         _log.warning("`%s`: nothing holds the plant at the set-point: %s", call, error)
         return False
 
 
-def _check_held(call: str, plant: Plant, placed: Cost, argument: str) -> bool:
+def _check_held(call: str, plant: Plant, placed: Cost) -> bool:
     """Refuse a set-point at which no input within the bounds holds the plant; as `check_within`."""
     still_plant, still = placed.regulated(plant)
     x, u = set_point(still_plant, still)
     check_rest(still_plant, x, u)
-    return check_within(call, argument, placed.bounds, u)
+    return check_within(call, "cost", placed.bounds, u)
 
 
 def slowest(policy: Callable[[Tensor], Tensor], plant: Plant, cost: Cost, period: float) -> Tensor:

@@ -26,6 +26,12 @@ def still(rows: int, steps: int, inputs: int = 1) -> Tensor:
     return torch.zeros(rows, steps, inputs, dtype=torch.float64)
 
 
+def inward(problem: adp.SampledProblem, u: Tensor, slope: Tensor) -> Tensor:
+    """The projected gradient at an admissible u: 0 where it points out of the box at a bound."""
+    out = ((u <= problem.bounds.low) & (slope > 0)) | ((u >= problem.bounds.high) & (slope < 0))
+    return torch.where(out, 0.0, slope)
+
+
 def two_inputs(low: Tensor | None = None, high: Tensor | None = None) -> adp.SampledProblem:
     """A point mass in the plane with drag, whose two coupled inputs have bounds of their own."""
     mixed = torch.tensor([[1.0, 0.4], [0.0, 1.0]], dtype=torch.float64)
@@ -74,7 +80,7 @@ def test_bounded_control_satisfies_the_optimality_conditions(
     cost = cost_of(problem, x0, control)
     torch.testing.assert_close(cost.detach(), found.cost, rtol=1e-12, atol=0)
     (slope,) = torch.autograd.grad(cost.sum(), control)
-    projected = problem.bounds.inward(found.control, slope)
+    projected = inward(problem, found.control, slope)
     assert float(projected.abs().max()) < 1e-5 * float(found.cost.max())
     assert bool(problem.bounds.contain(found.control).all())
     assert bool(((found.control == problem.bounds.low) | (found.control == problem.bounds.high)).any())
@@ -122,7 +128,7 @@ def test_no_iteration_raises_a_cost_and_what_is_called_converged_is_stationary()
     assert bool((torch.stack(costs).diff(dim=0) <= 0).all())
     assert bool(found.converged.any())
     slope = torch.func.grad(lambda u: cost_of(problem, WAVED_X, u).sum())(found.control)
-    free = problem.bounds.inward(found.control, slope)[found.converged]
+    free = inward(problem, found.control, slope)[found.converged]
     assert float(free.abs().max()) < 1e-3
 
 

@@ -183,7 +183,7 @@ def test_plan_is_replayed_at_its_cost(convex: adp.Optimum) -> None:
 def test_saturated_swing_up_is_not_passed_off_as_an_optimum() -> None:
     hanging = torch.tensor([[math.pi, 0.0]], dtype=torch.float64)
     cost = adp.BoundedInputCost(1.0, 0.1, dim=2, inputs=1, bound=2.0)
-    shooting = adp.DirectShooting(systems.Pendulum(), cost, horizon=2.0, intervals=40, starts=1, iterations=1)
+    shooting = adp.DirectShooting(systems.Pendulum(), cost, horizon=2.0, intervals=16, starts=1, iterations=1)
     best = shooting.solve(hanging)
     assert not best.converged.any()
     assert best.reason[0].endswith("of the value: it is saturated")
