@@ -80,7 +80,7 @@ class LoopAbout:
 
 
 def _bounds(holder: object, depth: int = 3) -> Bounds | None:
-    """Return the bounds of the inputs that a controller was made with, or what it is made of; None for none."""
+    """Return the bounds of the inputs that a controller, or what is inside, was made with; None for none."""
     bounds = getattr(holder, "bounds", None)
     if isinstance(bounds, Bounds) and bounds.present:
         return bounds

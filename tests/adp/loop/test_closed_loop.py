@@ -566,8 +566,8 @@ def test_supervisor_regulates_a_grid_of_initial_weights() -> None:
 def test_bounds_that_a_controller_was_made_with_are_those_of_its_loop() -> None:
     plant, cost = systems.Pendulum(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
     x0 = torch.tensor([[0.3, 0.0]], dtype=torch.float64)
-    policy = adp.near_optimal(plant, cost, dt=0.05, low=-6.0, high=8.0, reach="local", horizon=0.2)
-    for controller in (policy, adp.Feedback(policy)):
-        loop = adp.simulate(controller, plant, cost, x0, steps=1)
+    policy = adp.LQR(plant, cost.bounded(-6.0, 8.0))
+    for controller in (policy, adp.Supervised(adp.Feedback(policy), policy, cost)):
+        loop = adp.simulate(controller, plant, cost, x0, dt=0.05, steps=1)
         assert "bounds -6 to 8" in repr(loop)
         assert "bounds" in loop.figure().axes[2].get_legend_handles_labels()[1]
