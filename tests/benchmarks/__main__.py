@@ -120,7 +120,14 @@ PARTS = {
         {
             "rollout policy: mean cost over the optimum": "rollout_policy_ratio_mean",
             "rollout policy: share regulated": "rollout_policy_regulated",
+            "rollout policy: median cost over the optimum": "rollout_policy_ratio_median",
             "the law as published: share regulated": "staf_as_published_1_ms_regulated",
+            "the law as published: median cost over the optimum": "staf_as_published_1_ms_ratio_median",
+            "in information form: share regulated": "staf_information_form_regulated",
+            "supervised: share regulated": "staf_information_supervised_regulated",
+            "supervised: median cost over the optimum": "staf_information_supervised_ratio_median",
+            "LQR: median cost over the optimum": "lqr_ratio_median",
+            "three fixed quadratics: median": "global_quadratic_fixed_box_ratio_median",
             "LQR: mean cost over the optimum": "lqr_ratio_mean",
             "25 fixed Gaussians": "rbf_grid_fixed_box_ratio_mean",
             "three fixed quadratics": "global_quadratic_fixed_box_ratio_mean",
@@ -174,6 +181,16 @@ PARTS = {
         "'rivals.methods=[near_optimal,box-DDP,plan followed,PathIntegral,GlobalValue]'",
         {f"a control of {name}, pendulum, us": US.format(name) for name in PLANNERS},
         2,
+    ),
+    "discs": Part(
+        "staf experiment=avoidance",
+        {
+            "1000 scenarios of three discs: collisions of the LQR": "lqr_constraint_violations",
+            "behind the filter": "constraint_violations",
+            "mean cost of the LQR": "lqr_cost_mean",
+            "mean cost behind the filter": "cost_mean",
+        },
+        1,
     ),
     "faults": Part(
         "staf experiment=faults",
