@@ -98,7 +98,7 @@ def _parser() -> argparse.ArgumentParser:
         "rows": "settings with a column of their own, a row for each combination (all that were swept)",
         "columns": "settings whose values become columns of each metric",
         "metric": "metrics (md, tex: the headlines; else all)",
-        "aggregate": f"of {', '.join(AGGREGATES)}, over the runs of a row; n and failed count them",
+        "aggregate": f"any of {', '.join(AGGREGATES)}, over the runs of a row; n and failed count them",
         "sort": "columns to sort by, smallest first; NAME:desc for the largest first",
     }
     for name, text in lists.items():

@@ -21,7 +21,7 @@ def without_setting(name: str) -> str:
     known = _settings()
     if choices := known.get(name):
         shown = ", ".join(choices[:4]) + (", ..." if len(choices) > 4 else "")
-        return f"there is no setting `{name}` with what is chosen; {shown} has it."
+        return f"there is no setting `{name}` with these choices; {shown} has it."
     if name in known:
         whole = name.partition(".")[0]
         return f"`{name}` cannot be set where `{whole}` is one value: omit `{whole}=...`."

@@ -331,11 +331,11 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
     "unknown group": ("sytem=pendulum", ("did you mean `system`?",)),
     "key of another choice": (
         "kernel.width=0.5",
-        ("`kernel.width` with what is chosen; ", "kernel=gaussian has it."),
+        ("`kernel.width` with these choices; ", "kernel=gaussian has it."),
     ),
     "swept choices of which one has a key": (
         "-m kernel=gaussian,custom kernel.path=a.B",
-        ("`kernel.path` with what is chosen; kernel=custom has it.",),
+        ("`kernel.path` with these choices; kernel=custom has it.",),
     ),
     "unknown command": ("doctro", ("there is no command `doctro`; did you mean `doctor`?",)),
     "broken syntax": ("initial_state=[1.0", ("[1.0",)),

@@ -32,9 +32,9 @@ INFEASIBLE = 1e-6  # slack, in units of the input, from which on a row counts as
 _PASSES, _MOST = 2, 8  # linearisations at least, the first at the wanted control; at most, until all is met
 _SOLVED = 1e-6  # of what a wanted control misses, at which it is
 _OPPOSED = (
-    "`SafetyFilter`: this filter may not keep constraint %s: %s. To keep it, plan instead: `AvoidanceCost` "
-    "with `RecedingHorizon`, see adp/safety/README.md. Why: braking along constraint %s drives the rest of "
-    "the plant away, at %s 1/s near its equilibrium (a coordinate that must first move the wrong way)."
+    "`SafetyFilter`: this filter may fail to keep constraint %s: %s. To keep it, plan instead: "
+    "`AvoidanceCost` with `RecedingHorizon`, see adp/safety/README.md. Why: braking along constraint %s drives "
+    "the rest of the plant away, at %s 1/s near its equilibrium (a coordinate that must first move the wrong way)."
 )
 _FOLLOWS = (
     "the policy is left alone wherever it stays inside by itself, and what it cannot keep is `infeasible`"
