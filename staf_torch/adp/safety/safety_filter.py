@@ -33,8 +33,9 @@ _PASSES, _MOST = 2, 8  # linearisations at least, the first at the wanted contro
 _SOLVED = 1e-6  # of what a wanted control misses, at which it is
 _OPPOSED = (
     "`SafetyFilter`: this filter may fail to keep constraint %s: %s. To keep it, plan instead: "
-    "`AvoidanceCost` with `RecedingHorizon`, see adp/safety/README.md. Why: braking along constraint %s drives "
-    "the rest of the plant away, at %s 1/s near its equilibrium (a coordinate that must first move the wrong way)."
+    "`AvoidanceCost` with `RecedingHorizon`, see adp/safety/README.md. Why: braking along constraint %s "
+    "drives the rest of the plant away, at %s 1/s near its equilibrium (a coordinate that must first move "
+    "the wrong way)."
 )
 _FOLLOWS = (
     "the policy is left alone wherever it stays inside by itself, and what it cannot keep is `infeasible`"
