@@ -194,8 +194,8 @@ for _upper, _left, _unit in itertools.product([True, False], repeat=3):
 
 @pytest.mark.needs_compiler
 def test_programs_factor_and_solve_as_torch_does() -> None:
-    """Four by four written out, nine by nine a row a pass; of other triangles only one is read;
-    a pivot that is not positive, first pivots that are zero, rows that are lost."""
+    """Four by four written out, nine by nine in memory; of other triangles only one is read;
+    a pivot that is not positive, first pivots that are zero, rows that are lost; on a device, too."""
     torch.manual_seed(1)
     few, many = (torch.randn(9, size, size).double() for size in (4, 9))
     grams = [some @ some.mT + torch.eye(some.shape[-1]) for some in (few, many)]
@@ -220,6 +220,8 @@ def test_programs_factor_and_solve_as_torch_does() -> None:
     program = lanes.Program(step)
     assert program.compiles((), (), given, steps=1)
     found, wanted = (run((), (), given, steps=1)[1] for run in (program, program.definition))
+    with lanes.device.host():
+        torch.testing.assert_close(program((), (), given, steps=1)[1], found, equal_nan=True)
     (factor, failed), (known, place) = found.pop("of many"), wanted.pop("of many")
     assert torch.equal(failed, place)
     assert place[3] > 0

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from typing import ClassVar, NamedTuple
 
 from ..trace.graph import FLAG, NARROW, REAL, ROW, STEP, WHOLE, WIDE, Graph
+from .eliminations import EliminationWriter
 from .identifiers import checked_names, guarded
-from .matrices import MatrixWriter
 from .schedule import Schedule, Sizes
 
 _NAMES = {"abs": "fabs", "round": "rint"}
@@ -59,11 +59,11 @@ _PHILOX = """%(how)s %(real)s %(name)s(%(given)s)
 """
 
 
-class ScalarWriter(MatrixWriter):
+class ScalarWriter(EliminationWriter):
     """Writer of scalar code, common to C and CUDA C: every number is a variable of its own."""
 
-    _infix: ClassVar[dict[str, str]] = MatrixWriter._infix | {"and": "&&", "or": "||", "xor": "!="}
-    _prefix: ClassVar[dict[str, str]] = MatrixWriter._prefix | {"not": "!"}
+    _infix: ClassVar[dict[str, str]] = EliminationWriter._infix | {"and": "&&", "or": "||", "xor": "!="}
+    _prefix: ClassVar[dict[str, str]] = EliminationWriter._prefix | {"not": "!"}
 
     def __init__(self, graph: Graph, schedule: Schedule, layout: Sizes, names: Names) -> None:
         self.real, self._suffix = ("float", "f") if graph.single else ("double", "")

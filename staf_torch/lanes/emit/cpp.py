@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import ClassVar
 
-from ..trace.graph import FLAG, NARROW, NOW, REAL, ROW, STEP, WHOLE, Graph
+from ..trace.graph import FLAG, IN_PLACE, NARROW, NOW, REAL, ROW, STEP, WHOLE, Graph
 from .schedule import Schedule, Sizes
 from .tables import TableWriter, Text
 
@@ -79,7 +79,7 @@ def _work(graph: Graph, schedule: Schedule) -> dict[str, int]:
         op, count = graph.op[node], graph.size(node)
         if op in _FREE:
             continue
-        if op == "tridiagonal":
+        if op in IN_PLACE:
             count, op = graph.aux[node][1][0] ** 3, "add"
         elif op in ("map", "dot"):
             count *= graph.aux[node][1] if op == "dot" else 1

@@ -47,13 +47,7 @@ class MatrixWriter(StatementWriter):
             self._line(f"{kind} a{node}{_ARRAYS[name]}[{entries * self.copies}];")
         self._variables(node, 1, 0.0)
         with self._over("i0_0", "0", size), self._over("i0_1", "0", "i0_0 + 1"):
-            ats = [
-                self._sum(["i0_0", "i0_1"], *index)
-                if index is not None
-                else self._lookup(places, f"i0_0 * {size} + i0_1")
-                for _, places in leaves(self.graph, self._taken_over, node)
-                for index in [evenly(places, [size, size])]
-            ]
+            ats = self._entry_of_each(node, [size, size])
             for j in range(self.copies):
                 h, most = self._part("h", node, _packed("i0_0", "i0_1"), j), f"t{node}_1{self._copy(j)}"
                 self._line(f"{h} = {self._mapped(node, iter(ats), j)};")
@@ -71,6 +65,15 @@ class MatrixWriter(StatementWriter):
             for j in range(self.copies):
                 h = self._part("h", node, "i0_0", j)
                 self._line(f"{h} = {h} / t{node}_1{self._copy(j)};")
+
+    def _entry_of_each(self, node: int, sizes: list[int]) -> list[str]:
+        """Return where entry (i0_0, i0_1) of a matrix is in each of what is read."""
+        found = []
+        for _, places in leaves(self.graph, self._taken_over, node):
+            index = evenly(places, sizes)
+            regular = None if index is None else self._sum(["i0_0", "i0_1"], *index)
+            found.append(self._lookup(places, f"i0_0 * {sizes[1]} + i0_1") if regular is None else regular)
+        return found
 
     def _reflector(self, node: int, size: int) -> None:
         """Column i0_0 below the diagonal as the vector v of a reflection, scaled by x = 2 / v'v."""

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..trace.graph import FIXED, NOW, REAL, ROW, STEP, Graph
+from ..trace.graph import FIXED, IN_PLACE, NOW, REAL, ROW, STEP, Graph
 
 
 class Sizes(NamedTuple):
@@ -239,7 +239,7 @@ def taken_over(graph: Graph, schedule: Schedule) -> set[int]:
             counts[argument] += 1
     found, length = set[int](), dict[int, int]()
     for node in sorted(schedule.live):
-        if graph.op[node] not in ("map", "tridiagonal"):
+        if graph.op[node] not in ("map", *IN_PLACE):
             continue
         length[node] = 1
         sizes = [s for s in graph.aux[node][1] if s > 1]
@@ -255,11 +255,11 @@ def taken_over(graph: Graph, schedule: Schedule) -> set[int]:
             if 8 * len(entries) > 10 * len(set(entries)) or length[node] + more > _LONGEST:
                 continue
             inside = [places for read in reads for _, places in leaves(graph, found, argument, read)]
-            anyhow = graph.op[node] == "tridiagonal"  # looks up places where they are irregular
+            anyhow = graph.op[node] in IN_PLACE  # looks up places where they are irregular
             if anyhow or all(evenly(places, sizes) is not None for places in inside):
                 found.add(argument)
                 length[node] += more
-        if graph.op[node] == "tridiagonal":  # reads as a map does, and is computed where it stands
+        if graph.op[node] in IN_PLACE:  # reads as a map does, and is computed where it stands
             del length[node]
     return found
 

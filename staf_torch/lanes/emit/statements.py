@@ -10,7 +10,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from ..trace.graph import EXACT, FIXED, NARROW, Graph
+from ..trace.graph import EXACT, FIXED, IN_PLACE, NARROW, Graph
 from ..trace.tracer import NotLoweredError
 from .schedule import Schedule, Sizes, evenly, leaves
 
@@ -48,7 +48,7 @@ def runs(places: Sequence[tuple[Hashable, int]]) -> list[EvenRun]:
 
 _INPUTS = ("const", "param", "elem", "result", "results", "collect", "carry", "carrys", "state", "row", "now")
 _INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/", "lt": "<", "le": "<=", "eq": "==", "ne": "!="}
-_ARRAYS = ("pack", "map", "dot", "tridiagonal", "collect", "carrys", "results")
+_ARRAYS = ("pack", "map", "dot", *IN_PLACE, "collect", "carrys", "results")
 
 
 class StatementWriter(abc.ABC):
@@ -172,7 +172,7 @@ class StatementWriter(abc.ABC):
                 continue
             if op == "loop":
                 self._loop(self.graph.aux[node])
-            elif op in ("pack", "map", "dot", "tridiagonal"):
+            elif op in ("pack", "map", "dot", *IN_PLACE):
                 getattr(self, f"_{op}")(node)
             else:
                 for j in range(self.copies):

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..trace.graph import Graph
 from ..trace.tracer import LARGE
-from .matrices import MatrixWriter
+from .eliminations import EliminationWriter
 from .schedule import Schedule, Sizes, ends_with, taken_over
 
 
@@ -31,7 +31,7 @@ class Text(NamedTuple):
         return table.to(real)
 
 
-class TableWriter(MatrixWriter):
+class TableWriter(EliminationWriter):
     """A writer of programs that run for many rows and times.
 
     Attributes:

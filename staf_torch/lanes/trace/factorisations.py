@@ -2,18 +2,23 @@
 
 LAPACK exchanges rows where a pivot asks for it. Rows in lanes have pivots of their own, so nothing may branch
 on one: a row is chosen by comparing and selecting, and places are compared in place of exchanged. Up to
-`LARGE` entries an elimination is written out and lives in registers; above, one pass is a loop's body, and
-the matrix moves up by a row and a column after it, so that the text knows the first pivot alone. Eliminations
+`LARGE` entries an elimination is written out and lives in registers; above, Cholesky's and the one under a
+triangle are an operation of a program, in place. The others are loops, in which a matrix moves up by a row
+and a column after each pass, so that the text knows the first pivot alone. Eliminations
 by columns: Golub and Van Loan, Matrix Computations, ch. 3 to 5.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from torch import Tensor
+from torch.utils._python_dispatch import _disable_current_modes
 
-from ..loops import repeat
+from ..loops import repeat, tracer_of
+from .graph import REAL, WIDE
 from .tracer import LARGE
 
 
@@ -222,6 +227,15 @@ def log_of_determinant(matrix: Tensor) -> Tensor:
 def _rolled_cholesky(gram: Tensor) -> tuple[Tensor, Tensor]:
     """L with L L' = K, and 0 or, where a pivot is not positive, its place: (..., M, M), (...)."""
     size = gram.shape[-1]
+    where = _of_one(gram)
+    if where is not None:
+        tracer, kind = where
+        with _disable_current_modes():
+            factor, failed = torch.linalg.cholesky_ex(gram.detach())
+        found = tracer.cholesky(tracer.nodes(gram, kind).reshape(-1), size, kind)
+        tracer.attach(factor, found[:-1].reshape(factor.shape))
+        place = tracer.attach(torch.empty_like(factor[..., 0, 0]), found[-1].reshape(failed.shape))
+        return factor, place.to(torch.int32)
     place, zero = _places(gram), torch.zeros_like(gram[..., 0])
 
     def eliminate(carry: tuple[Tensor, Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -243,6 +257,16 @@ def _rolled_cholesky(gram: Tensor) -> tuple[Tensor, Tensor]:
 def _rolled_triangular(lower: Tensor, right: Tensor, *, unitriangular: bool) -> Tensor:
     """T^-1 B of a lower triangle: (..., M, M), (..., M, P)."""
     size = lower.shape[-1]
+    where = _of_one(lower, right)
+    if where is not None:
+        tracer, kind = where
+        with _disable_current_modes():
+            given = lower.detach(), right.detach()
+            solution = torch.linalg.solve_triangular(*given, upper=False, unitriangular=unitriangular)
+            solution = solution.contiguous()
+        sides = (tracer.nodes(part, kind).reshape(part.shape[-2:]) for part in (lower, right))
+        found = tracer.substitute(np.concatenate([*sides], axis=1), kind, unitriangular)
+        return tracer.attach(solution, found.reshape(solution.shape))
     place, done = _places(lower), torch.zeros_like((lower[..., 0, :1] + right[..., 0, :1])[..., 0])
     batch = done.shape
 
@@ -282,6 +306,16 @@ def _rolled_orthogonal(matrix: Tensor) -> tuple[Tensor, Tensor]:
     start = matrix.clone(), identity.clone(), torch.zeros_like(matrix[..., 0, 0])
     rest, q, _ = repeat(size - 1, reflect, start)
     return q, torch.cat((rest[..., 1:], rest[..., :1]), dim=-1).triu()
+
+
+def _of_one(*matrices: Tensor) -> tuple[Any, str] | None:
+    """Return the tracer of single matrices that an operation in place serves, and the type of its numbers."""
+    tracer = next(filter(None, map(tracer_of, matrices)), None)
+    alone = all(matrix.shape[:-2].numel() == 1 for matrix in matrices)
+    if tracer is None or not alone or not any(map(tracer.traced, matrices)):
+        return None
+    kinds = {tracer.kind(matrix.dtype) for matrix in matrices}
+    return (tracer, kinds.pop()) if kinds in ({REAL}, {WIDE}) else None
 
 
 def _places(matrix: Tensor) -> Tensor:

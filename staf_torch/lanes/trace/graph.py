@@ -65,6 +65,10 @@ _COMMUTE = frozenset({"add", "mul", "eq", "ne", "and", "or", "xor"})
 _COMPARE = frozenset({"lt", "le", "eq", "ne"})
 
 
+IN_PLACE = ("tridiagonal", "cholesky", "substitute", "substitute_unit")
+"""Operations on a matrix in memory, which write over a copy of it."""
+
+
 class Graph:
     """Nodes in topological order; a node that has been made before is not made again.
 
@@ -151,8 +155,8 @@ class Graph:
         op, aux = self.op[node], self.aux[node]
         if op == "map":
             return math.prod(aux[1])
-        if op == "tridiagonal":
-            return 2 * int(aux[1][0])
+        if op in IN_PLACE:
+            return 2 * int(aux[1][0]) if op == "tridiagonal" else math.prod(aux[1]) + (op == "cholesky")
         if op in ("collect", "carrys", "results"):
             return int(aux[2])
         return int(aux if op == "pack" else aux[0]) if op in ("pack", "dot") else 1

@@ -210,6 +210,19 @@ class Tracer(TorchDispatchMode):
         aux = ("copy", (size, size), tuple(places.tolist()))
         return self.entries(self.graph.add("tridiagonal", (array,), kind, aux), kind, 2 * size)
 
+    def cholesky(self, flat: Ids, size: int, kind: str) -> Ids:
+        """Return L, row by row, of a matrix K = L L', and 0 or the place of a pivot that is not positive."""
+        array, places = self.array(flat, kind)
+        aux = ("copy", (size, size), tuple(places.tolist()))
+        return self.entries(self.graph.add("cholesky", (array,), kind, aux), kind, size * size + 1)
+
+    def substitute(self, rows: Ids, kind: str, unit: bool) -> Ids:
+        """Return T^-1 B of (T B), a lower triangle and what is beside it: (M, M + P) -> (M, P)."""
+        array, places = self.array(rows.reshape(-1), kind)
+        aux = ("copy", rows.shape, tuple(places.tolist()))
+        node = self.graph.add("substitute_unit" if unit else "substitute", (array,), kind, aux)
+        return self.entries(node, kind, rows.size).reshape(rows.shape)[:, len(rows) :]
+
     def _folds(self, arrays: Sequence[Ids]) -> bool:
         op = self.graph.op
         return all(op[n] == "const" for array in arrays for n in set(array.reshape(-1).tolist()))
