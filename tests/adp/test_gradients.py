@@ -144,6 +144,55 @@ def test_what_is_designed_without_autograd_refuses_to_be_asked_later() -> None:
         after.sum().backward()
 
 
+def learner(law: Callable[[adp.Gains], adp.ActorCriticLaw]) -> Callable[..., Tensor]:
+    """The cost of a loop of an actor-critic, of a gain, the first weights, Gam(0) and the state."""
+    centers = st.StateFollowingCenters(st.rings(3), st.StateRadius(0.7, 1e-5))
+    basis = adp.StaFValueBasis(st.StaFBasis(st.AnchoredKernel(st.ExponentialKernel()), centers)).double()
+    plant, cost = systems.TwoState(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+    points = adp.QuadraturePoints(3, 2, half_width=0.4)
+
+    def found(actor: Tensor, critic: Tensor, weights: Tensor, gain: Tensor, x: Tensor) -> Tensor:
+        first = {"critic": critic, "actor": weights, "gain": gain}
+        control = adp.ActorCritic(basis, plant, cost, points, law(adp.Gains(actor=actor)), **first)
+        return adp.simulate(control, plant, cost, x, dt=0.01, steps=2, compile=False).cost
+
+    return found
+
+
+def identified(theta: Tensor, critic: Tensor, x: Tensor) -> Tensor:
+    plant, cost = systems.TwoStateTracking(), adp.tracking_cost(10.0, 1.0)
+    basis = adp.LeadingCoordinates(adp.QuadraticBasis(2), dim=4)
+    inside = adp.ActorCritic(basis, plant, cost, adp.RandomPoints(1, half_width=0.3), critic=critic)
+    control = adp.IdentifyingTracker(inside, plant, adp.ConcurrentLearning(3, 2), theta)
+    return adp.simulate(control, plant, cost, x, dt=0.005, steps=4, compile=False).cost
+
+
+def adapted(critic: Tensor, actor: Tensor, x: Tensor) -> Tensor:
+    plant = adp.ParametricPlant(
+        lambda x, u: torch.stack((torch.zeros_like(u), -x[..., 1:]), dim=-2),
+        lambda x, u: torch.stack((x[..., 1], u[..., 0] - x[..., 0].sin()), dim=-1),
+        dim=2,
+        inputs=1,
+        theta=[0.3],
+        rows=[1],
+    )
+    first = {"critic": critic, "actor": actor}
+    points = adp.QuadraturePoints(3, 2, half_width=0.2)
+    inside = adp.ActorCritic(adp.QuadraticBasis(2), plant, COST, points, adp.PolicyIteration(), **first)
+    law = adp.LeastSquares([0.0], deviation=1.0, floor=1e-5)
+    control = adp.AdaptiveActorCritic(inside, plant, adp.IntegralWindows(plant, 0.02), law)
+    return adp.simulate(control, plant, COST, x, dt=0.02, steps=6, compile=False).cost
+
+
+def tracked(q: Tensor, r: Tensor, size: Tensor, x: Tensor) -> Tensor:
+    plant = systems.Clocked(PLANT)
+    path = lambda t: torch.stack((size * t.sin(), size * t.cos()), dim=-1)  # noqa: E731
+    cost = adp.TrackingCost(q, r, dim=2, inputs=1, path=path)
+    return loop(lambda x: x[..., :2] @ tensor([[-9.0], [-3.0]]), plant, cost, plant.at(x))
+
+
+WEIGHTS = tensor([0.4, 0.3, 0.5]), tensor([0.28, 0.2, 0.3])
+LEARNED = tensor(1.2), *WEIGHTS, tensor(2.0), X0
 POLICIES: dict[str, tuple[Callable[..., Tensor], tuple[Tensor, ...]]] = {
     "LQR": (adp.LQR(PLANT, COST), (X0,)),
     "near_optimal": (adp.near_optimal(PLANT, COST, dt=0.1, reach="local").control, (X0[:1],)),
@@ -165,6 +214,13 @@ POLICIES: dict[str, tuple[Callable[..., Tensor], tuple[Tensor, ...]]] = {
         ),
         (tensor([[1.0, 2.0]]), X0, tensor(1.0), tensor([1.0, 2.0])),
     ),
+    "Published": (learner(adp.Published), LEARNED),
+    "Information": (learner(adp.Information), LEARNED),
+    "Frozen": (learner(adp.Frozen), LEARNED),
+    "PolicyIteration": (learner(adp.PolicyIteration), LEARNED),
+    "IdentifyingTracker": (identified, (0.1 * torch.ones(3, 2).double(), WEIGHTS[0], uniform(1, 4))),
+    "AdaptiveActorCritic": (adapted, (*WEIGHTS, X0[:1])),
+    "TrackingCost": (tracked, (tensor([1.0, 2.0]), tensor([[0.1]]), tensor(0.3), X0)),
     "Linear": (lambda a: loop(plant=systems.Linear(a, [[0.0], [1.0]])), (torch.eye(2).double(),)),
     "systems.simulate": (lambda x, g: systems.simulate(Gravity(g), x, dt=0.1, steps=2), (X0, tensor(1.0))),
 }
