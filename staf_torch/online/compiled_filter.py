@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from ..lanes.compiler import compiled
+from ..lanes.log import say
 from .kalman_filter import LocalFilter, StreamState, blocks_of
 from .local_functions import LocalFunctions
 from .own_functions import OwnFunctions
@@ -141,7 +142,11 @@ class CompiledFilter:
         plain = isinstance(functions, OwnFunctions) or (
             functions.rate is not None and functions.shared is not None and functions.stationary
         )
-        if not plain or real is None or state.count > _MOST or state.blocks.device.type != "cpu":
+        where = state.blocks.device
+        if where.type not in ("cpu", "meta"):
+            told = f"its machine code is of the processor, and the samples are on {where}; `x.cpu()` runs it"
+            say("the filter of streams", told)
+        if not plain or real is None or state.count > _MOST or where.type != "cpu":
             return definition
         sizes = f"DIM={state.dim}", f"COUNT={state.count}", f"OUTPUTS={state.outputs}"
         call = compiled(NATIVE / "_filter.cpp", *sizes, f"REAL={real}", *(["OWN=1"] if own else []))

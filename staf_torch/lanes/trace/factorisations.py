@@ -10,8 +10,6 @@ by columns: Golub and Van Loan, Matrix Computations, ch. 3 to 5.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -19,7 +17,7 @@ from torch.utils._python_dispatch import _disable_current_modes
 
 from ..loops import repeat, tracer_of
 from .graph import REAL, WIDE
-from .tracer import LARGE
+from .tracer import LARGE, Tracer
 
 
 def in_memory(matrix: Tensor) -> bool:
@@ -262,11 +260,11 @@ def _rolled_triangular(lower: Tensor, right: Tensor, *, unitriangular: bool) -> 
         tracer, kind = where
         with _disable_current_modes():
             given = lower.detach(), right.detach()
-            solution = torch.linalg.solve_triangular(*given, upper=False, unitriangular=unitriangular)
-            solution = solution.contiguous()
+            known = torch.linalg.solve_triangular(*given, upper=False, unitriangular=unitriangular)
+            known = known.contiguous()
         sides = (tracer.nodes(part, kind).reshape(part.shape[-2:]) for part in (lower, right))
         found = tracer.substitute(np.concatenate([*sides], axis=1), kind, unitriangular)
-        return tracer.attach(solution, found.reshape(solution.shape))
+        return tracer.attach(known, found.reshape(known.shape))
     place, done = _places(lower), torch.zeros_like((lower[..., 0, :1] + right[..., 0, :1])[..., 0])
     batch = done.shape
 
@@ -308,7 +306,7 @@ def _rolled_orthogonal(matrix: Tensor) -> tuple[Tensor, Tensor]:
     return q, torch.cat((rest[..., 1:], rest[..., :1]), dim=-1).triu()
 
 
-def _of_one(*matrices: Tensor) -> tuple[Any, str] | None:
+def _of_one(*matrices: Tensor) -> tuple[Tracer, str] | None:
     """Return the tracer of single matrices that an operation in place serves, and the type of its numbers."""
     tracer = next(filter(None, map(tracer_of, matrices)), None)
     alone = all(matrix.shape[:-2].numel() == 1 for matrix in matrices)
