@@ -15,7 +15,7 @@ from ..lanes.one_thread import small
 from ..lanes.row_numbers import over_rows
 from ..lanes.row_objects import Rowwise, beyond_rows
 from ..local_basis import Degrees, LocalBasis, LocalSpace
-from ..numerics.checks import fail, learns, sampled, trailing, values_of
+from ..numerics.checks import beside_batch, fail, learns, sampled, trailing, values_of
 from ..numerics.row_checks import check_kernel
 from .coefficient_format import compare, decode, encode, record
 
@@ -132,6 +132,7 @@ class StaFBasis(nn.Module, metaclass=Rowwise):
         The first evaluation at y = x warns where sigma(x; x) is the same at every state: `check_own_value`.
         """
         trailing("StaFBasis", "y", y, dims=2, last=self.dim)
+        beside_batch("StaFBasis", "y", y, 2, x.shape[:-1], "x is")
         if self._unseen and _same(y, x):
             self.check_own_value(x.detach(), stacklevel=5)
         sigma: Tensor = self.kernel(y, self.centers(x))

@@ -12,7 +12,7 @@ from torch.nn.utils import parametrize
 
 from ..lanes.gradients import refuse_gradient
 from ..lanes.one_thread import alone
-from ..numerics.checks import choice, fail, flag, hold, integer, trailing
+from ..numerics.checks import beside_batch, choice, fail, flag, hold, integer, trailing
 from ..numerics.default_device import beside
 from ..numerics.linalg import row_jacobian
 from ..numerics.row_checks import check_target
@@ -203,6 +203,7 @@ class StaF(nn.Module):
 
         For radii near the rounding of x, where y - x has no digits left.
         """
+        beside_batch("StaF.at_offsets", "z", z, 2, self.state.shape[:-1], "the coefficients are")
         x, coefficients = _wide(self.state), self._outputs_first(z.dim() - 2)
         return self._outputs_last(self.basis.local(x).evaluate(z.to(x.dtype), coefficients)).to(z.dtype)
 
@@ -260,6 +261,7 @@ class StaF(nn.Module):
         """
         choice("StaF.hessian", "mode", mode, _MODES)
         trailing("StaF.hessian", "y", y, dims=2, last=self.basis.dim)
+        beside_batch("StaF.hessian", "y", y, 2, self.state.shape[:-1], "the coefficients are")
         x = _wide(self.state)
         given, y = y.dtype, y.to(x.dtype)
         z = y - x.unsqueeze(-2)
@@ -285,6 +287,7 @@ class StaF(nn.Module):
                 f"`{call}(y=...)` of the shape {tuple(y.shape)} must say which points are meant: one of each "
                 f"batch entry ({one_each}), or all of them for every entry (`{whole}`, ({ones}, P, n))."
             )
+        beside_batch(call, "y", y, 2, batch, "the coefficients are")
 
     def _along(self, y: Tensor, z: Tensor, mode: str, target: Target | None) -> Callable[[Tensor], Tensor]:
         """V^ as a function of a step of both y and x, with what else moves in this mode."""

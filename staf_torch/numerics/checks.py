@@ -260,6 +260,28 @@ def trailing(
     raise ValueError(f"`{call}({name}=...)` must be a tensor, as by `{write}`; got {got}.")
 
 
+def beside_batch(call: str, name: str, value: Tensor, dims: int, batch: Sequence[int], of: str) -> None:
+    """Refuse a tensor whose sizes before its last ``dims`` do not broadcast with those of a batch.
+
+    Args:
+        call: the door.
+        name: of the argument.
+        value: what was given.
+        dims: of it that belong to no batch.
+        batch: the sizes.
+        of: what has them, for the message.
+    """
+    leading = value.shape[: value.dim() - dims]
+    pairs = zip(reversed(leading), reversed(batch), strict=False)
+    if leading != batch and not all(size == other or size == 1 or other == 1 for size, other in pairs):
+        rule = f"is for {_counted(leading)}, but {of} for {_counted(batch)}: as many, or 1"
+        raise ValueError(f"`{call}({name}=...)` {rule}; got the shape {tuple(value.shape)}.")
+
+
+def _counted(sizes: Sequence[int]) -> str:
+    return f"{' x '.join(map(str, sizes))} state{'' if list(sizes) == [1] else 's'}"
+
+
 def states(holder: object, name: str, x: Tensor, last: int | None = None) -> Tensor:
     """Return states that are floating-point numbers, refused by `trailing` otherwise; for methods that are
     called at every stage of a step.

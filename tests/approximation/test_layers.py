@@ -346,3 +346,14 @@ def test_distributed_data_parallel_trains_a_layer() -> None:
 def test_a_bad_argument_is_named_with_its_value(make, message: str) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_points_of_another_batch_are_refused_with_both_numbers() -> None:
+    staf, y = fixed("gaussian", (5,)), uniform(7, 3, 2)
+    for call in (staf, staf.gradient, staf.hessian, staf.at_offsets):
+        with pytest.raises(
+            ValueError, match=r"is for 7 states, but the coefficients are for 5 states: .*\(7, 3, 2\)"
+        ):
+            call(y)
+    with pytest.raises(ValueError, match=r"`StaFBasis\(y=...\)` is for 7 states, but x is for 5 states"):
+        staf.basis(y, staf.state)
