@@ -157,7 +157,7 @@ class StaF(nn.Module):
             coefficients = coefficients if self.out_features is None else coefficients.movedim(0, -2)
             self.state.copy_(x)
             if "parametrizations" in self._modules and parametrize.is_parametrized(self, "coefficients"):
-                self.coefficients = coefficients  # type: ignore[assignment]  # by its right inverse
+                self.coefficients = coefficients  # by its right inverse
             else:
                 self.coefficients.copy_(coefficients)
         self._remember(target)

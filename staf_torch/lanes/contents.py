@@ -24,7 +24,7 @@ from collections.abc import Callable, Iterator
 from itertools import chain
 from operator import is_
 from types import BuiltinFunctionType, CellType, CodeType, FunctionType, MethodType, ModuleType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -316,7 +316,7 @@ class Walk(pickle.Pickler):
             attributes, owners = vars(value), [value]
             if "parametrizations" in value._modules and parametrize.is_parametrized(value):
                 kind = parametrize.type_before_parametrizations(value)  # torch's of it refuses to be written
-                owners += value.parametrizations.values()
+                owners += cast("nn.ModuleDict", value.parametrizations).values()
             if _is_layer(kind):
                 self.layers.update(id(part) for owner in owners for part in owner._parameters.values())
             plain = kind.__getstate__ is object.__getstate__ and not kind.__dict__.get("__slotnames__", True)

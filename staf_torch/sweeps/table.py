@@ -125,7 +125,7 @@ def fill(
         ):
             workers.check()
             own = [line for line in overrides[begin + index] if line.partition("=")[0] not in shared]
-            row = {"num": begin + index, "overrides": own}
+            row: dict[str, Any] = {"num": begin + index, "overrides": own}
             row |= _result(cfgs, index, outcome, place(index), keep)
             gone = isinstance(outcome, Failed) and isinstance(outcome.error, LostError)
             lost += gone

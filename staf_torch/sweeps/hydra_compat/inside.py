@@ -36,7 +36,8 @@ with contextlib.suppress(ImportError):  # of the latest versions
 def configure_logging(log: dict[str, Any] | None, verbose: Any) -> None:
     """Set up logging as `hydra.core.utils.configure_log` does, from settings that are plain and resolved."""
     if log is None or verbose is not False:
-        configure_log(None if log is None else OmegaConf.create(log), verbose)
+        given: Any = None if log is None else OmegaConf.create(log)  # which Hydra takes, and does not say
+        configure_log(given, verbose)
     elif log["root"] is not None:
         _configure(log)
 
