@@ -43,7 +43,7 @@ _OWN: Node = {
     "required": ["_target_"],
 }
 _FIGURES: Node = {
-    "draw": {"type": "boolean"},
+    "draw": {"enum": [True, False, "auto"]},
     "width": {"type": "number", "description": "inches; a column of a paper is 3.4"},
     "font": {
         "type": ["number", "string"],

@@ -63,6 +63,9 @@ _HIGHEST = 9.0  # inches of all panels: a page
 _STRIP, _TALL = 1.35, 2.0  # inches that it is high, in one column and in several
 
 
+AUTO = "auto"  # of `figures.draw`
+
+
 class FigurePaper(NamedTuple):
     """The column that a figure is printed in: its width and the type of all its texts."""
 
@@ -72,7 +75,7 @@ class FigurePaper(NamedTuple):
 
     @classmethod
     def of(cls, figures: object) -> FigurePaper:
-        """Return the paper of the setting `figures`: true, false, or `draw`, `width` and `font`.
+        """Return the paper of the setting `figures`: true, false, or `draw` (or `auto`), `width` and `font`.
 
         Raises:
             ValueError: if the setting breaks its rule.
@@ -82,8 +85,8 @@ class FigurePaper(NamedTuple):
         if not isinstance(figures, Mapping) or not set(figures) <= {"draw", "width", "font"}:
             rule = "must be true or false, or have draw, width and font"
             raise fail(COMMAND_LINE, "figures", rule, figures)
-        if not isinstance(figures.get("draw", True), bool):
-            raise fail(COMMAND_LINE, "figures.draw", "must be true or false", figures["draw"])
+        if not isinstance(drawn := figures.get("draw", True), bool) and drawn != AUTO:
+            raise fail(COMMAND_LINE, "figures.draw", f"must be true, false or {AUTO}", drawn)
         return cls.chosen(COMMAND_LINE, "figures.", figures.get("width"), figures.get("font"))
 
     @classmethod
@@ -133,16 +136,28 @@ class FigurePaper(NamedTuple):
 
 
 def draws(figures: object) -> bool:
-    """Return whether the setting `figures` asks for figures.
+    """Return whether the setting `figures` asks for figures: `auto` does but in a job of a sweep.
 
     Raises:
         ValueError: as `FigurePaper.of`.
     """
     FigurePaper.of(figures)
-    return figures is True or (isinstance(figures, Mapping) and bool(figures.get("draw", True)))
+    asked = figures.get("draw", True) if isinstance(figures, Mapping) else figures
+    return not _SWEPT.get() if asked == AUTO else asked is True
+
+
+@contextlib.contextmanager
+def in_a_sweep(swept: bool = True) -> Iterator[None]:
+    """Draw no figures of jobs meanwhile, unless they are asked for: the sweep's report has its own."""
+    token = _SWEPT.set(swept)
+    try:
+        yield
+    finally:
+        _SWEPT.reset(token)
 
 
 _DEFAULT = FigurePaper()
+_SWEPT: ContextVar[bool] = ContextVar("_SWEPT", default=False)
 _PAPER: ContextVar[FigurePaper] = ContextVar("_PAPER", default=_DEFAULT)
 _KEPT: ContextVar[list[Any] | None] = ContextVar("_KEPT", default=None)
 _WANTED: ContextVar[list[Wanted]] = ContextVar("_WANTED")

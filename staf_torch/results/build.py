@@ -15,7 +15,7 @@ import json
 import os
 import platform
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -143,17 +143,20 @@ def _hash(name: str) -> str | None:
     return _module(place[0], stamp.st_mtime_ns, stamp.st_size)[0]
 
 
-def differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]:
+def differences(
+    then: Mapping[str, Any], now: Mapping[str, Any], free: Callable[[str], bool] = lambda key: False
+) -> Iterator[str]:
     """Yield one phrase for each setting, or other entry of a record, that is not what it was.
 
     Args:
         then: the record of a run: `settings` and `build`, where it has them.
         now: the same of a run of today.
+        free: whether the setting of that key may differ.
     """
     was, will = _plain(then.get("settings")), _plain(now.get("settings"))
     for key in sorted({*was, *will}) if was else ():
         before, after = was.get(key, _ABSENT), will.get(key, _ABSENT)
-        if before != after:
+        if before != after and not free(key):
             yield f"{key} was {_shown(before)} and is now {_shown(after)}"
     was, will = _plain(then.get("build")), _plain(now.get("build"))
     for key in ("source", "torch", "compiler") if was else ():

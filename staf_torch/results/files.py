@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeGuard, TypeVar
@@ -17,6 +18,9 @@ SWEEP, PAGE, TABLE = "sweep.json", "report.html", "table"
 FIGURES, HYDRA = "figures", ".hydra"
 COMPLETED, FAILED, RUNNING, UNFINISHED = "completed", "failed", "running", "unfinished"
 """Status of a run: it ended, it raised, it has not said that it ended, or there is no word of its end."""
+
+FREE = ("figures", "animation", "tracker")
+"""Settings that change no number: a sweep that is resumed may have others."""
 
 Value = str | float | int | bool | list[Any] | None
 """What a setting holds; a list may hold lists."""
@@ -31,6 +35,11 @@ def grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list
     for item in items:
         groups.setdefault(key(item), []).append(item)
     return groups
+
+
+def is_free(line: str) -> bool:
+    """Return whether an override, or a dotted key, is about one of `FREE`."""
+    return re.split(r"[.=@/]", line.lstrip("+~"), maxsplit=1)[0] in FREE
 
 
 def is_number(value: object) -> TypeGuard[int | float]:

@@ -11,7 +11,7 @@ import math
 import os
 import re
 import sys
-from collections import ChainMap
+from collections import ChainMap, Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -30,6 +30,7 @@ from .files import (
     RUNNING,
     SWEEP,
     UNFINISHED,
+    is_free,
     is_number,
     parse_overrides,
     partial_name,
@@ -140,15 +141,21 @@ def _not_started(directory: Path, rows: Sequence[RecordedRun]) -> Iterator[Skipp
     if not isinstance(jobs, list) or not all(isinstance(job, dict) for job in jobs):
         yield Skipped(directory, f"{SWEEP} has no list of jobs")
         return
-    begun = {_identity(run.overrides) for run in rows if directory in run.directory.parents}
+    own = [run for run in rows if directory in run.directory.parents]
+    begun = {_identity(run.overrides) for run in own}
     waiting = [job.get("num") for job in jobs if _identity(parse_overrides(_lines(job))) not in begun]
     if waiting:
         listed = ", ".join(map(str, waiting[:_LISTED])) + (", ..." if len(waiting) > _LISTED else "")
-        yield Skipped(directory, f"{len(waiting)} of {len(jobs)} jobs have not started: {listed}")
+        counts = Counter(run.status for run in own)
+        ended = "".join(f"; {counts[status]} {status}" for status in counts)
+        goes_on = f"`staf -m sweep.resume={directory}` runs what is missing, unless the sweep still goes on"
+        told = f"{len(waiting)} of {len(jobs)} jobs have not started: {listed}{ended}. {goes_on}"
+        yield Skipped(directory, told)
 
 
 def _identity(overrides: Mapping[str, Value]) -> tuple[tuple[str, str], ...]:
-    return tuple(sorted((key, identity(value)) for key, value in overrides.items()))
+    """Return what tells a job from the others of its sweep."""
+    return tuple(sorted((key, identity(value)) for key, value in overrides.items() if not is_free(key)))
 
 
 def read_run(directory: Path) -> list[RecordedRun]:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from .._version import __version__
 from .build import shortened
-from .files import Value, is_number
+from .files import Value, is_free, is_number
 from .metric_info import HEADLINES, OWN, MetricInfo
 from .untrusted import visible
 
@@ -136,10 +136,14 @@ class Collection:
 
     @functools.cached_property
     def swept(self) -> tuple[str, ...]:
-        """The overridden settings that differ between runs; of a single run, those that were overridden."""
+        """The overridden settings that differ between runs; of a single run, those that were overridden.
+
+        Those that change no number, such as `figures`, are none.
+        """
+        typed = [key for key in self._overridden if not is_free(key)]
         if len(self.rows) == 1:
-            return tuple(self._overridden)
-        found = [k for k in self._overridden if len({identity(run.setting(k)) for run in self.rows}) > 1]
+            return tuple(typed)
+        found = [k for k in typed if len({identity(run.setting(k)) for run in self.rows}) > 1]
         return (*found, *self.unswept)
 
     @functools.cached_property
@@ -165,7 +169,8 @@ class Collection:
         builds = {run.build for run in self.rows}
         hashes = {module for run in self.rows for module in run.modules.items()}
         differ = len(builds) > 1 or len(hashes) > len({name for name, _ in hashes})
-        return (*(key for key in found if not _explained(key, overridden)), *["build"] * differ)
+        told = (key for key in found if not is_free(key) and not _explained(key, overridden))
+        return (*told, *["build"] * differ)
 
     @functools.cached_property
     def _settings(self) -> list[Mapping[str, Value]]:

@@ -18,7 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 from .._version import __version__
 from ..numerics import COMMAND_LINE, fail
 from .build import build, checksums, damaged, differences, imported, machine, record_checksum
-from .files import COMPLETED, METRICS, ROWS, flatten, plain, write_text
+from .files import COMPLETED, METRICS, ROWS, flatten, is_free, plain, write_text
 from .files import RUN as RUN
 from .files import SWEEP as SWEEP
 from .metric_info import MetricInfo
@@ -78,7 +78,9 @@ class RunRecord:
     @property
     def made_by(self) -> str:
         """Hash of settings, overrides, source, modules, torch and compiler."""
-        return record_checksum({key: value for key, value in self._about.items() if key != "metrics"})
+        about = {key: value for key, value in self._about.items() if key != "metrics"}
+        about["settings"] = {k: value for k, value in about["settings"].items() if not is_free(k)}
+        return record_checksum(about | {"overrides": _decisive(about["overrides"])})
 
     def declare(self, metrics: Sequence[MetricInfo]) -> None:
         """Add metrics of the user's own, so that a table knows them without their code."""
@@ -126,9 +128,10 @@ class RunRecord:
         record = read(directory / RUN)
         if record is None or record.get("status") != COMPLETED:
             return None
-        if record.get("overrides") != self._about["overrides"]:
-            lines = record.get("overrides")
-            typed = " ".join(map(str, lines)) if isinstance(lines, list) else str(lines)
+        lines = record.get("overrides")
+        listed = isinstance(lines, list) and all(isinstance(line, str) for line in lines)
+        if not listed or _decisive(lines) != _decisive(self._about["overrides"]):
+            typed = " ".join(lines) if listed else str(lines)
             typed = typed if len(typed) <= _LINE else f"{typed[: _LINE - 3]}..."
             raise ValueError(
                 f"{directory} holds the run {typed!r}, where this sweep has "
@@ -161,7 +164,7 @@ class RunRecord:
 
     def _differences(self, record: Mapping[str, Any]) -> str:
         """Return what differs between an earlier record and this one, the first few."""
-        told = list(differences(record, self._about))
+        told = [*differences(record, self._about, is_free)]
         if record.get("version") != __version__:
             then = str(record.get("version"))[:_SHOWN]
             told.insert(0, f"it was written by staf_torch {then}, and this is {__version__}")
@@ -172,6 +175,10 @@ class RunRecord:
 def own(overrides: Sequence[str]) -> list[str]:
     """Return the overrides of a job itself, without those about the sweep that it is part of."""
     return [line for line in overrides if not line.lstrip("+~").startswith(f"{SETTINGS}.")]
+
+
+def _decisive(overrides: Sequence[str]) -> list[str]:
+    return [line for line in overrides if not is_free(line)]
 
 
 def flat(cfg: DictConfig) -> dict[str, Any]:

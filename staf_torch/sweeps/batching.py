@@ -22,7 +22,7 @@ from ..experiments.registry import (
     check_animation,
     experiment,
 )
-from ..figures.style import FigurePaper, printed_on
+from ..figures.style import FigurePaper, in_a_sweep, printed_on
 from ..results.progress import SHOWN, Progress
 from ..settings.plain import to_read
 from ..settings.suggestions import without_option, without_setting
@@ -171,7 +171,8 @@ def solve(cfgs: Sequence[DictConfig], progress: Progress) -> list[Outcome]:
         study = experiment(to_read(cfgs)[0].task)
         if not isinstance(study, BatchedExperiment):
             return [DEFERRED for _ in cfgs]
-        solutions = study.solve(cfgs, progress)
+        with in_a_sweep():
+            solutions = study.solve(cfgs, progress)
         return [Failed(each) if isinstance(each, Exception) else Computed(each) for each in solutions]
     except Exception as error:
         if len(cfgs) == 1:

@@ -22,7 +22,7 @@ from omegaconf import DictConfig, OmegaConf
 from ..figures.style import FigurePaper, draws, printed_on
 from ..numerics import COMMAND_LINE, fail
 from ..results import run_record as records
-from ..results.files import COMPLETED, PAGE, ROWS
+from ..results.files import COMPLETED, FAILED, PAGE, ROWS
 from ..results.reader import RecordedRun, collect
 from ..results.untrusted import links_in, visible
 from . import lock
@@ -338,12 +338,15 @@ def farewell(config: DictConfig | None, error: KeyboardInterrupt, said: str) -> 
     notes = getattr(error, "__notes__", ())
     if config is None or notes:
         return "; ".join([f"staf: {said}", *notes])
-    runs = list(_directory(config).glob(f"*/{records.RUN}"))
-    if not runs:
+    ended = [records.read(path) or {} for path in _directory(config).glob(f"*/{records.RUN}")]
+    if not ended:
         return f"staf: {said}"
-    complete = sum((records.read(path) or {}).get("status") == COMPLETED for path in runs)
+    complete = sum(run.get("status") == COMPLETED for run in ended)
+    failed = sum(run.get("status") == FAILED and run.get("reason") != "interrupted" for run in ended)
+    jobs = max(len((records.read(_directory(config) / records.SWEEP) or {}).get("jobs", ())), len(ended))
+    told = f"{complete} of {jobs} jobs are complete, {failed} failed, {jobs - complete - failed} are to do"
     place = os.path.relpath(_directory(config))
-    return f"staf: {said}; {complete} jobs are complete. Resume with:\n  staf -m sweep.resume={place}"
+    return f"staf: {said}; {told}. Resume with:\n  staf -m sweep.resume={place}"
 
 
 def _directory(config: DictConfig) -> Path:

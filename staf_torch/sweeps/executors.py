@@ -16,6 +16,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
+from ..figures.style import in_a_sweep
 from ..numerics.checks import integer
 from ..results.progress import SHOWN, Progress
 from ..settings.plain import ManySettings
@@ -275,7 +276,7 @@ def solve_elsewhere(pickled: bytes, path: Sequence[str], packages: Sequence[str]
 def _run_whole(cfg: DictConfig, directory: Path) -> Outcome:
     """Run an experiment that takes no part in batches, and keep its log for the parent."""
     directory.mkdir(parents=True, exist_ok=True)
-    with _kept_log() as lines:
+    with _kept_log() as lines, in_a_sweep():
         try:
             return Written(completion(cfg, DEFERRED)(cfg, directory, SHOWN), lines)
         except Exception as error:

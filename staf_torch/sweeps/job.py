@@ -16,6 +16,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from ..experiments.registry import Metrics
+from ..figures.style import in_a_sweep
 from ..lanes.compiler import compiler
 from ..numerics.checks import COMMAND_LINE, choice
 from ..results import run_record as records
@@ -70,7 +71,8 @@ def execute(
             if about.alone and records.completed(directory) is not None:
                 _log.info("replaces the run of the same command line in %s", os.path.relpath(directory))
             name = choices.get("experiment") or cfg.task
-            with Sign(f"experiment {name}"), recorded(record, directory, seconds):
+            swept = in_a_sweep(node.mode != RunMode.RUN)
+            with Sign(f"experiment {name}"), recorded(record, directory, seconds), swept:
                 record.declare([metric.info for metric in make_metrics(cfg.get("metric"))])
                 record.measured_in(units_of(cfg))
                 metrics = completion(cfg, outcome)(cfg, directory, progress)

@@ -9,10 +9,11 @@ from pathlib import Path
 
 from .. import __version__
 from ..results import run_record as records
+from ..results.files import FREE, is_free
 from ..results.untrusted import visible
 from ..settings.trust import may_run_code
 from .callbacks import refuse_many
-from .hydra_compat import overrides_in
+from .hydra_compat import overrides_in, parse_override
 
 _RESUME = "sweep.resume="
 _ANYWAY = "sweep.resume_anyway=true"
@@ -42,8 +43,11 @@ def command_line(argv: Sequence[str]) -> list[str]:
         _check_length(directory, [line for line in (*typed, *hydra) if line not in given])
     refuse_many(directory, typed)
     own = [line for line in given if not _is_hydra(line) and line in records.own([line])]
-    if own and sorted(own) != sorted(typed):
-        raise ValueError(_difference(directory, own, typed))
+    free = [*dict.fromkeys(line for line in own if _is_free(line) and line not in typed)]
+    own, decisive = ([line for line in lines if not _is_free(line)] for lines in (own, typed))
+    if own and sorted(own) != sorted(decisive):
+        raise ValueError(_difference(directory, own, decisive))
+    typed = [line for line in typed if not any(_replaces(new, line) for new in free)] + free
     about_sweep = [line for line in given if line not in records.own([line]) and not line.startswith(_RESUME)]
     hydra = _merged(hydra, [*about_sweep, *filter(_is_hydra, given)])
     foreign = [line for line in (*typed, *hydra) if line not in given and may_run_code(line)]
@@ -122,6 +126,17 @@ def _is_hydra(line: str) -> bool:
     return line.lstrip("+~").startswith(("hydra.", "hydra/"))
 
 
+def _is_free(line: str) -> bool:
+    """Return whether a line may change: no number does with it, and it makes no jobs."""
+    return is_free(line) and not parse_override(line).is_sweep_override()
+
+
+def _replaces(new: str, old: str) -> bool:
+    """Return whether a setting takes the place of another: it is the same, or a part of it, or its group."""
+    after, before = _key(new), _key(old)
+    return _is_free(old) and (f"{after}.".startswith(f"{before}.") or f"{before}.".startswith(f"{after}."))
+
+
 def _key(line: str) -> str:
     return line.lstrip("+~").partition("=")[0]
 
@@ -141,6 +156,6 @@ def _difference(directory: Path, given: Sequence[str], typed: Sequence[str]) -> 
     parts = [f"without {missing!r}"] * bool(missing) + [f"with {added!r}"] * bool(added)
     return (
         f"`staf -m sweep.resume={directory}` must have the overrides of that sweep, or none; "
-        f"got them {' and '.join(parts) or 'more than once'}. Only settings of Hydra and of the sweep itself "
-        f"(hydra. ..., sweep. ...) may be added. The sweep is: staf -m {' '.join(typed)}"
+        f"got them {' and '.join(parts) or 'more than once'}. Only settings that change no number may be "
+        f"others (hydra. ..., sweep. ..., {', '.join(FREE)}). The sweep is: staf -m {' '.join(typed)}"
     )

@@ -22,7 +22,7 @@ from ..experiments.registry import check_animation
 from ..lanes.compiler import compiler
 from ..results import run_record as records
 from ..results.build import checksums, damage, modules
-from ..results.files import ROWS, open_after, partial_name
+from ..results.files import ROWS, is_free, open_after, partial_name
 from ..results.progress import Progress
 from ..results.run_directory import RunDirectory
 from ..results.untrusted import UnreadableError, parse_object, read_lines
@@ -208,7 +208,8 @@ def _saying_how_to_resume(directory: Path, total: int) -> Iterator[list[int]]:
     except KeyboardInterrupt as error:
         place = os.path.relpath(directory)
         error.add_note(
-            f"{done[0]} of {total} jobs are complete. Resume with:\n  staf -m sweep.resume={place}"
+            f"{done[0]} of {total} jobs have a row, {total - done[0]} are to do. "
+            f"Resume with:\n  staf -m sweep.resume={place}"
         )
         raise
 
@@ -242,7 +243,8 @@ def _result(cfgs: ManySettings, index: int, outcome: Outcome, directory: Path, k
 
 def made_by(settings: Mapping[str, Any]) -> str:
     """Return a hash of the settings of a job, by dotted keys, and of the user's modules that they name."""
-    text = json.dumps([settings, modules(settings)], sort_keys=True)
+    decisive = {key: value for key, value in settings.items() if not is_free(key)}
+    text = json.dumps([decisive, modules(settings)], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:_DIGITS]
 
 

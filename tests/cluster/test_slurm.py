@@ -134,7 +134,7 @@ def test_a_sweep_that_is_killed_leaves_no_job_behind(node: SlurmNode, place: Pat
     run.terminate()
     out, _ = run.communicate(timeout=60)
     assert run.returncode == 143, out
-    assert "1 jobs are complete. Resume with:" in out
+    assert "1 of 2 jobs are complete, 0 failed, 1 are to do. Resume with:" in out
     for _ in range(100):
         left = node.run("squeue", "-h", "-o", "%i %T").stdout.split("\n")
         if not any(line and "COMPLETING" not in line for line in left):

@@ -155,7 +155,7 @@ def interrupted(cfg: object, directory: Path, progress: object = None) -> dict[s
 
 @pytest.mark.usefixtures("_untouched")
 def test_ctrl_c_leaves_a_sweep_that_can_be_resumed_and_a_process_as_it_was() -> None:
-    with pytest.raises(KeyboardInterrupt, match=r"1 jobs are complete.*\n.*sweep.resume=sweep"):
+    with pytest.raises(KeyboardInterrupt, match=r"1 of \d+ jobs are complete.*\n.*sweep.resume=sweep"):
         staf_torch.sweep("task=test_python_api.interrupted", "seed=0,1,2", directory="sweep")
     assert [run.status for run in staf_torch.read_runs("sweep")] == ["completed", "failed"]
     with pytest.raises(KeyboardInterrupt):

@@ -68,7 +68,7 @@ def test_overrides_that_are_repeated_are_those_of_the_sweep_in_any_order(tmp_pat
     for given, words in (
         (
             ["seed=0,1"],
-            "without 'kernel=gaussian'. Only settings .* The sweep is: staf -m seed=0,1 kernel=gaussian$",
+            "without 'kernel=gaussian'. Only .*figures.* The sweep is: staf -m seed=0,1 kernel=gaussian$",
         ),
         (["seed=0,1", "kernel=gaussian", "dt=1", "spread=2"], "with 'dt=1 spread=2'. Only"),
         (["kernel=matern", "seed=0,1"], "without 'kernel=gaussian' and with 'kernel=matern'. Only"),
@@ -103,6 +103,21 @@ def test_lines_about_hydra_are_taken_over_but_those_that_change(tmp_path: Path) 
         *("-m", "seed=0,1", "hydra.verbose=true", "sweep.objective=ball_error"),
         *("hydra/launcher=joblib", "hydra.launcher.n_jobs=3", *end(place)),
     ]
+
+
+def test_settings_that_change_no_number_may_be_others(tmp_path: Path) -> None:
+    typed = ["seed=0,1", "figures.width=3.4", "animation=false"]
+    place = sweep(tmp_path, typed)
+    assert lines(place) == ["--multirun", *typed, *end(place)]
+    for given, kept in (
+        ("figures=false", typed[2:]),
+        ("figures.draw=true", typed[1:]),
+        ("tracker=none", typed[1:]),
+    ):
+        for whole in ([], ["seed=0,1"], [typed[0], given]):
+            assert lines(place, *whole, given)[1:-2] == ["seed=0,1", *kept, given]
+    with pytest.raises(ValueError, match="with 'figures=true,false'"):  # these are other jobs
+        lines(place, "seed=0,1", "figures=true,false")
 
 
 @pytest.mark.parametrize("record", [None, "[]", '{"overrides": []}', '{"hydra": []}', "damaged"])

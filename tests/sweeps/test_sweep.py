@@ -25,6 +25,7 @@ from staf_torch.experiments.registry import Metrics
 from staf_torch.results import run_record as records
 from staf_torch.results.files import write_metrics
 from staf_torch.results.progress import SHOWN, Progress
+from staf_torch.results.reader import collect
 from staf_torch.sweeps.job import objective
 from staf_torch.sweeps.launcher import SweepProgress
 
@@ -156,15 +157,17 @@ def test_a_resumed_sweep_runs_what_is_missing_and_ends_with_the_same_bits(
     first = (again / "0" / "run.json").stat().st_mtime_ns
     (again / "2" / "run.json").write_text(json.dumps(record(again / "2") | {"status": "running"}))
     (again / "1" / "run.json").unlink()
+    free = "figures.draw=false"  # the sweep was typed with `figures=false`
     code, out, err = one(
-        str(place), ["-m", f"sweep.resume=runs/{launcher}_again", f"hydra/launcher={launcher}"]
+        str(place), ["-m", f"sweep.resume=runs/{launcher}_again", f"hydra/launcher={launcher}", free]
     )
+    assert not collect(again).skipped
     assert code == 1  # the failed one fails again
     told = (
         "2 of 3 jobs completed, 1 failed" if launcher == "batched" else "completed before: runs/basic_again/0"
     )
     assert told in out, err
-    assert rows(again) == before
+    assert [*rows(again).values()] == [*before.values()]
     assert (again / "0" / "run.json").stat().st_mtime_ns == first
 
 
@@ -280,7 +283,9 @@ def test_a_defect_keeps_its_trace_and_spares_the_others(place: Path) -> None:
 
 def test_an_interrupted_sweep_says_how_to_resume(place: Path) -> None:
     directory, said = sweep(place, "interrupted", *OWN, "seed=range(3)", "+harm=Ctrl-C", code=130)
-    assert "1 jobs are complete" in said
+    assert "1 of 3 jobs are complete, 0 failed, 2 are to do" in said
+    (waiting,) = collect(directory).skipped
+    assert "1 of 3 jobs have not started: 2; 1 completed; 1 failed. `staf -m sweep.resume=" in waiting.reason
     assert said.endswith("staf -m sweep.resume=runs/interrupted\n")
     assert record(directory / "1")["reason"] == "interrupted"
     (place / "go on").touch()
