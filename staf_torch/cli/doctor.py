@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import shutil
 import sys
 import tempfile
 import time
@@ -56,6 +57,14 @@ def _findings() -> Iterator[tuple[str, str, bool]]:
     set_by = os.environ.get("OMP_NUM_THREADS", "not set")
     yield "threads", f"{torch.get_num_threads()} of torch, {cores} cores, OMP_NUM_THREADS {set_by}", True
     yield "gpu", *_gpu()
+    for name in ("sbatch", "squeue", "sacct"):  # of SLURM, by which sweeps run on a cluster
+        yield name, shutil.which(name) or "not found: no SLURM here", True
+    for name in ("submitit", "ray"):
+        extra = "slurm" if name == "submitit" else name
+        missing = (
+            f"not installed: pip install -e '.[{extra}]' in the clone for hydra.launcher.executor={name}"
+        )
+        yield name, installed(name) or missing, True
     for name, place in (("cache", cache()), ("runs", Path("runs")), ("scratch", Path(tempfile.gettempdir()))):
         yield name, *_place(place)
     yield "self-test", *_self_test()

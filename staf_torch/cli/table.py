@@ -37,6 +37,9 @@ examples:
   staf-table runs/* --aggregate mean,ci95 --metric ball_error,gradient_error --sort ball_error:desc
   staf-table runs/<sweep> --format tex --best bold --output table.tex
   staf-table runs/<sweep> --format tex --split kernel --caption "Errors." --label tab:errors
+columns: --rows chooses settings, --metric numbers. All names, and a table that fits a column of a page:
+  staf-table runs/<sweep> --format csv | head -1
+  staf-table runs/<sweep> --format tex --rows kernel,centers.radius --metric ball_error,cost_ratio
 """
 
 

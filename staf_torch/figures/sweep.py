@@ -14,7 +14,7 @@ import numpy as np
 
 from ..results.files import grouped
 from ..results.reader import Collection, RecordedRun, identity
-from ..results.run import as_text
+from ..results.run import CLASS_PATH, as_text, class_name
 from ..tables.aggregate import half_width, mean, rank
 from .style import colour, dash, legend, marker, panels, ticks
 
@@ -183,10 +183,15 @@ def _agreeing(run: RecordedRun, keys: Sequence[str]) -> str:
 
 
 def _title(run: RecordedRun, keys: Sequence[str]) -> str:
-    kernel = as_text(run.setting(KERNEL))
-    named = KERNEL in keys or (not keys and run.setting(KERNEL))
-    parts = [f"{_NAMES.get(kernel, kernel)} kernel"] if named else []
-    return ", ".join(parts + [f"{key} = {as_text(run.setting(key))}" for key in keys if key != KERNEL])
+    kernel, own = as_text(run.setting(KERNEL)), run.setting(KERNEL + CLASS_PATH)
+    named = {KERNEL, KERNEL + CLASS_PATH} & {*keys} or (not keys and run.setting(KERNEL))
+    kernel = class_name(own) if isinstance(own, str) else _NAMES.get(kernel, kernel)
+    parts = [f"{kernel} kernel"] if named else []
+    for key in keys:
+        if key not in (KERNEL, KERNEL + CLASS_PATH):
+            value = as_text(run.setting(key))
+            parts.append(f"{key} = {class_name(value) if key.endswith(CLASS_PATH) else value}")
+    return ", ".join(parts)
 
 
 def _split(

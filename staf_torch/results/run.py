@@ -211,6 +211,15 @@ def as_text(value: Value) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
+CLASS_PATH = ".path"
+"""End of the keys of settings that name a class of a user's own by its dotted path."""
+
+
+def class_name(path: str) -> str:
+    """Return the name of a class that its dotted path names: `mine.Cauchy` -> `Cauchy`."""
+    return path.rpartition(".")[2]
+
+
 def _typed(value: Value) -> str:
     """Return a value as the command line has it: false, not False."""
     return str(value).lower() if isinstance(value, bool) else "null" if value is None else str(value)

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from json import dumps
 
 from ..results.reader import Value
+from ..results.run import CLASS_PATH, class_name
 
 _SPREADS = ("std", "ci95")
 _COUNTS = ("n", "failed")
@@ -98,11 +99,20 @@ def show(number: Number, digits: int) -> str:
     return text if number.spread is None else f"{text} ± {significant(number.spread, 2)}"
 
 
+def _classes(name: str, cells: tuple[Number | str | None, ...]) -> tuple[Number | str | None, ...]:
+    """Return the classes that a setting such as `kernel.path` names without their modules, where all differ."""
+    if not name.endswith(CLASS_PATH):
+        return cells
+    short = {cell: class_name(cell) for cell in cells if isinstance(cell, str)}
+    unique = len(set(short.values())) == len(short)
+    return tuple(short[cell] if unique and isinstance(cell, str) else cell for cell in cells)
+
+
 def printed(columns: Sequence[Column], rows: Sequence[Row], style: Style) -> list[PrintedColumn]:
     """Return the columns as they are read."""
     found = []
     for column in columns:
-        cells = tuple(_cell(row.cells.get(column.name)) for row in rows)
+        cells = _classes(column.name, tuple(_cell(row.cells.get(column.name)) for row in rows))
         if column.shown and column.statistic is None:
             best = _best(cells, column, rows, style)
             name = "" if column.heading else column.name

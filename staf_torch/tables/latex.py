@@ -35,10 +35,10 @@ SYMBOLS: Mapping[str, tuple[str, str]] = {
     "dt": (r"$\Delta t$/s", "time step"),
     "optimizer.inner_steps": ("$k$", "steps of the update law at a time"),
     "trajectories": ("$B$", "trajectories"),
-    "ultimate_error": (r"$|V - \hat V|$", "largest error at the state"),
-    "ball_error": (r"$\sup |V - \hat V|$", "largest error in the ball"),
-    "ball_floor_error": (r"$\sup |V - V^\ast|$", "largest error in the ball with ideal weights"),
-    "gradient_error": (r"$\sup |\nabla V - \nabla \hat V|$", "largest error of the gradient"),
+    "ultimate_error": ("$e$", r"largest $|V - \hat V|$ at the state"),
+    "ball_error": ("$e_r$", r"largest $|V - \hat V|$ in the ball"),
+    "ball_floor_error": (r"$e_r^\ast$", "the same with ideal weights"),
+    "gradient_error": (r"$e_\nabla$", r"largest $|\nabla V - \nabla \hat V|$ at the state"),
     "condition_number": (r"$\kappa$", "condition number of the Gram matrix"),
     "settling_time": ("$t_s$/s", "time from which the excess is at most its ultimate value"),
     "cost": ("$J$", "cost"),
@@ -49,6 +49,7 @@ SYMBOLS: Mapping[str, tuple[str, str]] = {
 }
 """Settings and metrics: how a heading writes them, and what that is."""
 _STATISTICS = {"std": "standard deviation", "ci95": r"half the 95\,\% interval of the mean"}
+_COLUMN, _LETTER = 245.0, 4.3  # pt: a column of a page, a letter or digit of 8 pt
 _DECIMAL = range(-2, 4)  # powers of ten that are written out
 
 
@@ -132,6 +133,13 @@ def _one(table: Table, about: Print, part: str) -> str:
     ]
     lines += [f"{row} \\\\" for row in rows]
     lines += [r"\bottomrule", r"\end{tabular}"]
+    lines = [r"{\footnotesize\setlength{\tabcolsep}{4pt}%", *lines[:-1], lines[-1] + "}"]
+    width = sum(_width(column, digits, about.rename) for column in columns) + 8.0 * (len(columns) - 1)
+    if width > _COLUMN and not about.wide:
+        comments.append(
+            f"Some {width:.0f} pt wide, and a column is 230 to 250: choose columns by --metric and --rows, "
+            "shorten texts by --rename, or take both columns by --wide."
+        )
     meaning = " ".join(
         [*_meaning(columns, about.rename, runs), *([_heading(part, about.rename) + "."] if part else [])]
     )
@@ -143,14 +151,15 @@ def _one(table: Table, about: Print, part: str) -> str:
         caption = f"{about.caption} {meaning}".strip()
         name = "table*" if about.wide else "table"
         begin = [rf"\begin{{{name}}}", r"\centering", rf"\caption{{{caption}}}", *label]
-        lines = [
-            *begin,
-            r"\vspace{4pt}\footnotesize",
-            r"\setlength{\tabcolsep}{4pt}",
-            *lines,
-            rf"\end{{{name}}}",
-        ]
+        lines = [*begin, r"\vspace{4pt}", *lines, rf"\end{{{name}}}"]
     return "\n".join([*lines, *(f"% {line}" for line in comments)]) + "\n"
+
+
+def _width(column: PrintedColumn, digits: int, rename: Mapping[str, str]) -> float:
+    """Return about how wide a column is, in pt, in type of 8 pt: a symbol is as wide as a letter."""
+    texts = [_name(column, rename), *(_cell(column, row, digits, rename) for row in range(len(column.cells)))]
+    hidden = re.compile(r"\\(boldmath|textbf)|[${}^_\\,]|(?<=\\)[a-z]+")
+    return _LETTER * max(len(hidden.sub("", text)) for text in texts)
 
 
 def _label(label: str, part: str) -> str:

@@ -81,6 +81,10 @@ def test_curves_are_in_the_order_of_their_counts_and_points_of_their_radii(runs:
         ({}, ["exponential kernel"]),
         ({"kernel": ("matern", "gaussian")}, ["Matérn kernel", "Gaussian kernel"]),
         ({"kernel": (None,)}, [""]),
+        (
+            {"kernel": ("custom",), "kernel.path": ("mine.Cauchy", "__main__.Own")},
+            ["Cauchy kernel", "Own kernel"],
+        ),
         ({"dt": (0.1, 0.2)}, ["dt = 0.1", "dt = 0.2"]),
         (
             {"kernel": ("inverse_multiquadric", "other"), "centers": ("rings", "ball")},

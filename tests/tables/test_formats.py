@@ -95,9 +95,10 @@ def test_markdown_joins_mean_and_spread_and_marks_the_best(found: Collection) ->
 
 def test_latex_has_booktabs_two_lines_of_headings_and_powers_of_ten(found: Collection) -> None:
     text = latex_text(tabulate(found, PIVOT))
-    lines = text.splitlines()
+    size, *lines = text.splitlines()
+    assert size.startswith(r"{\footnotesize")  # so that it fits a column
     assert lines[0] == r"\begin{tabular}{@{}lrrrrll@{}}"
-    assert lines[2] == r" &  & \multicolumn{3}{c}{$\sup |V - \hat V|$} &  &  \\"
+    assert lines[2] == r" &  & \multicolumn{3}{c}{$e_r$} &  &  \\"
     assert lines[3] == r"\cmidrule(lr){3-5}"
     assert lines[4] == r"kernel & $r$ & $M$ = 3 & $M$ = 6 & $M$ = 7 & n & failed \\"
     assert [line for line in lines if "rule" in line and "cmid" not in line] == [
@@ -109,7 +110,7 @@ def test_latex_has_booktabs_two_lines_of_headings_and_powers_of_ten(found: Colle
     assert len(body) == 4
     assert all(line.endswith(r" \\") and line.count(" & ") == 6 for line in body)
     assert r"\boldmath\textbf{$(6.40 \pm 0.15) \times 10^{-4}$}" in body[0]
-    assert "largest error in the ball; $M$: number of centers. Mean $\\pm$ standard deviation.\n" in text
+    assert "in the ball; $M$: number of centers. Mean $\\pm$ standard deviation.\n" in text
     assert lines[-2].startswith("% 12 of 36 failed")
     assert lines[-1] == "% `kernel` was swept and changed no metric in any row."
 
@@ -300,6 +301,13 @@ def test_a_page_has_the_best_bold_and_every_text_as_it_is() -> None:
         "<tr><td>-</td><td>0.5</td></tr>"
         "<tr><td>c</td><td>-</td></tr></tbody></table><p>a &lt;note&gt; of 100 %</p>"
     )
+
+
+def test_classes_of_a_users_own_are_named_without_their_modules_where_all_differ() -> None:
+    for paths, shown in ((["mine.A", "__main__.B"], "A B"), (["mine.A", "other.A"], "mine.A other.A")):
+        table = Table.of([{"kernel.path": path, "m": 0.1} for path in paths])
+        assert " ".join(line.split()[1] for line in table.markdown().splitlines()[2:]) == shown
+        assert all(path in table.csv() for path in paths)
 
 
 def test_json_has_null_and_a_reason_for_what_it_cannot_hold() -> None:
