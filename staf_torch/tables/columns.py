@@ -11,6 +11,7 @@ from json import dumps
 from ..results.reader import Value
 from ..results.run import CLASS_PATH, class_name
 
+_Cells = tuple["Number | str | None", ...]
 _SPREADS = ("std", "ci95")
 _COUNTS = ("n", "failed")
 
@@ -99,8 +100,8 @@ def show(number: Number, digits: int) -> str:
     return text if number.spread is None else f"{text} ± {significant(number.spread, 2)}"
 
 
-def _classes(name: str, cells: tuple[Number | str | None, ...]) -> tuple[Number | str | None, ...]:
-    """Return the classes that a setting such as `kernel.path` names without their modules, where all differ."""
+def _classes(name: str, cells: _Cells) -> _Cells:
+    """Return what a setting such as `kernel.path` names without the modules, where the classes differ."""
     if not name.endswith(CLASS_PATH):
         return cells
     short = {cell: class_name(cell) for cell in cells if isinstance(cell, str)}
