@@ -140,7 +140,7 @@ def test_page_has_the_table_the_figures_and_the_settings_and_loads_nothing(sweep
     assert {path.name for path in sweep.iterdir() if path.is_dir()} - {"figures"} == {
         run[:-1] for run in runs
     }
-    assert "<dt>ball_error</dt><dd>largest |V - V^| over the ball" in text
+    assert "<dt>ball_error</dt><dd>largest |V - V^| over the closed ball" in text
     for name in ("error_against_radius", "error_map"):
         assert base64.b64encode((sweep / "figures" / f"{name}.png").read_bytes()).decode() in text
     assert "http" not in text.replace("https://hydra.cc", "")
