@@ -71,7 +71,7 @@ def execute(
             if about.alone and records.completed(directory) is not None:
                 _log.info("replaces the run of the same command line in %s", os.path.relpath(directory))
             name = choices.get("experiment") or cfg.task
-            swept = in_a_sweep(node.mode != RunMode.RUN)
+            swept = in_a_sweep(not about.alone)
             with Sign(f"experiment {name}"), recorded(record, directory, seconds), swept:
                 record.declare([metric.info for metric in make_metrics(cfg.get("metric"))])
                 record.measured_in(units_of(cfg))
