@@ -206,7 +206,7 @@ class Backward:
         size = max(1, sum(shape.numel() for shape, _ in compiled.carry) * compiled.real.itemsize)
         sums = sum((x.numel() if shared else x[0].numel()) for x, shared in self._summed) * 8
         most = self._ran.budget // (4 * sums + 1)  # rows of which the sums fit
-        rows = max(unit, most // unit * unit) if self._on_processor or not kept else call.rows
+        rows = max(unit, most // unit * unit)
         if kept:
             return rows, call.times
         # A thread of the CPU has a few rows' carries of all times at once, a device those of all rows.
