@@ -317,6 +317,11 @@ def _explain(cfg: DictConfig, solved: LoopSolution) -> None:
         if others:
             told = "  not as the paper prints it: %s; experiment=adp_as_printed is the print"
             _log.info(told, ", ".join(others))
+        if here["system.as_printed"]:
+            _log.info(
+                "  as the paper prints it, with its misprint: the drift has lost a '1 -', and the paper's V* is "
+                "not that of this plant (system=two_state is that of V*)"
+            )
     error, ratio = solved.optimum.control_error, solved.metrics["cost_ratio"]
     if error is not None and ratio is not None and ratio > 1 + _LEARNING:
         told = "  above the optimum: paid wherever u is not u*; at t = 0, by the first weights, |u-u*| is %s"

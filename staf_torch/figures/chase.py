@@ -96,11 +96,11 @@ def _errors(axes: Axes, history: ChaseHistory) -> None:
     error = np.abs(history.value - history.estimate)
     floor = np.abs(history.value - history.ideal_estimate)
     axes.semilogy(history.time, positive(error), color=colour(0), label=r"$|V - \hat V|$")
-    axes.semilogy(history.time, positive(floor), "--", color="0.4", label="ideal weights")
+    axes.semilogy(history.time, positive(floor), "--", color="0.4", label="of ideal $w$")
     excess = positive(history.excess)
-    axes.semilogy(history.time, excess, "-.", color=colour(1), label="excess")
+    axes.semilogy(history.time, excess, "-.", color=colour(1), label="$F(a) - F(w)$")
     decades(axes, _DECADES)
-    axes.set_ylabel("error at $x$, excess")
+    axes.set_ylabel("error at $x$; excess $F$")
 
 
 def draw_convergence(found: Sequence[ConvergenceCurve]) -> Figure:

@@ -44,10 +44,10 @@ def of_a_chase(count: int) -> Drawn:
     errors = [0.1 * T, 0.01 * T, positive(excess)]  # on a logarithmic axis
     names = ["$x_{1}$", "$x_{2}$", "$V(x)$", r"$\hat V(x)$"]
     names += [f"$a_{{{i + 1}}}$" for i in range(count)] if count < 7 else ["weights $a$"]
-    names += ["ideal $w$", r"$|V - \hat V|$", "ideal weights", "excess"]
+    names += ["ideal $w$", r"$|V - \hat V|$", "of ideal $w$", "$F(a) - F(w)$"]
     figure = chase.draw_chase(chase.ChaseHistory(T, *parts, excess))
     shown = [(T, values) for values in (*parts[:3], *parts[4:], *errors)]
-    return Drawn(figure, shown, ["state $x$", "value", "weights", "error at $x$, excess"], names)
+    return Drawn(figure, shown, ["state $x$", "value", "weights", "error at $x$; excess $F$"], names)
 
 
 def of_a_memory(dim: int) -> Drawn:
