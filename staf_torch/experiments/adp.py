@@ -319,8 +319,8 @@ def _explain(cfg: DictConfig, solved: LoopSolution) -> None:
             _log.info(told, ", ".join(others))
         if here["system.as_printed"]:
             _log.info(
-                "  as the paper prints it, with its misprint: the drift has lost a '1 -', and the paper's V* is "
-                "not that of this plant (system=two_state is that of V*)"
+                "  as the paper prints it, with its misprint: the drift lost a '1 -', and the paper's V* "
+                "is not that of this plant (system=two_state is that of V*)"
             )
     error, ratio = solved.optimum.control_error, solved.metrics["cost_ratio"]
     if error is not None and ratio is not None and ratio > 1 + _LEARNING:

@@ -129,9 +129,9 @@ class RunRecord:
         if record is None or record.get("status") != COMPLETED:
             return None
         lines = record.get("overrides")
-        listed = isinstance(lines, list) and all(isinstance(line, str) for line in lines)
-        if not listed or _decisive(lines) != _decisive(self._about["overrides"]):
-            typed = " ".join(lines) if listed else str(lines)
+        texts = [str(line) for line in lines] if isinstance(lines, list) else None
+        if texts is None or _decisive(texts) != _decisive(self._about["overrides"]):
+            typed = " ".join(texts) if texts is not None else str(lines)
             typed = typed if len(typed) <= _LINE else f"{typed[: _LINE - 3]}..."
             raise ValueError(
                 f"{directory} holds the run {typed!r}, where this sweep has "
