@@ -210,7 +210,7 @@ class Backward:
         if kept:
             return rows, call.times
         # A thread of the CPU has a few rows' carries of all times at once, a device those of all rows.
-        held = size * (_ROWS * threads if self._on_processor else min(rows, call.rows))
+        held = size * min(_ROWS * threads if self._on_processor else rows, call.rows)
         if held * call.times <= self._ran.budget:
             return rows, call.times
         times = min(call.times, max(math.isqrt(call.times) + 1, self._ran.budget // (2 * held)))
