@@ -258,6 +258,8 @@ def test_the_search_finds_a_method_and_asks_no_server(site: Path, tmp_path: Path
                 break
         assert "polynomial_degree" in found
         assert browser.value("document.querySelectorAll('math').length") > 1  # typeset, and shown as such
+        tall = "[...document.querySelectorAll('.formula math')].map(m => m.getBoundingClientRect().height)"
+        assert 0 < max(browser.value(tall)) < 80  # a line, not a column of signs
         assert {address.partition(":")[0] for address in browser.requests} <= {"file", "data", "blob"}
 
 
