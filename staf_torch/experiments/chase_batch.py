@@ -29,6 +29,7 @@ Sink = Callable[[Mapping[str, np.ndarray], int, int], None]
 HISTORY = ("state", "value", "estimate", "weights", "ideal_weights", "excess")
 _DRAWN = (*HISTORY, "ideal_estimate")
 _ROWS = 4096  # at most that go through time together: memory does not grow with rows
+_ROWS_OF_JOBS = 512  # the same of several problems, whose results are small: their memory counts
 _ON_DEVICE = 32  # times as many rows there, and as much memory: a launch costs as much for few as for many
 _FEW, _BYTES = 64, 2**26  # rows at least, and bytes at most, where a history is kept: it is written by rows
 _TIMES, _SEEN = 64, 20  # of a piece, at least; pieces
@@ -144,7 +145,9 @@ def _run(
         errors=errors,
     )
     tell = _of_whole_problems(advance, len(starts), len(members))
-    blocks, chunk = _pieces(starts, times, basis, kept=any(member.sink is not None for member in members))
+    blocks, chunk = _pieces(
+        starts, times, basis, jobs=len(members), kept=any(member.sink is not None for member in members)
+    )
     told = alone and len(blocks) == 1  # the engine warns of the reach, else each member of its own
     done, reach = 0, torch.zeros(len(starts), dtype=starts.dtype, device=starts.device)  # largest |x| nu(x)
     with torch.no_grad(), warnings.catch_warnings():
@@ -171,6 +174,7 @@ def _run(
                     _distribute(result, done, time, members)
                     time += result.state.shape[1]
                     tell(result.state.shape[0] * result.state.shape[1])
+                    del result  # before the next one is made
             done += len(block)
     if alone and not told:
         basis.warn_reach(float(reach.max()), stacklevel=2)
@@ -178,17 +182,20 @@ def _run(
     return [member.outcome(summary, float(own.max()), alone=alone) for member, summary, own in found]
 
 
-def _pieces(starts: Tensor, times: int, basis: StaFBasis, *, kept: bool) -> tuple[Sequence[Tensor], int]:
+def _pieces(
+    starts: Tensor, times: int, basis: StaFBasis, *, jobs: int, kept: bool
+) -> tuple[Sequence[Tensor], int]:
     """Return the initial states (B, n) in blocks that go through time together, and the times of a piece.
 
     Args:
         starts: of all rows.
         times: of the chase.
         basis: at every state.
+        jobs: problems whose rows they are.
         kept: whether a history is.
     """
     share, size = 1 if starts.is_cpu else _ON_DEVICE, starts.element_size()
-    together = share * _ROWS
+    together = share * (_ROWS_OF_JOBS if starts.is_cpu and jobs > 1 else _ROWS)
     if starts.is_cpu:  # so few that a piece has as many times as a program needs to be worth while
         together = min(together, max(_FEW, chunk_length(min(times, _TIMES), basis, size)))
     if kept:

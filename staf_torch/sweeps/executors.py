@@ -68,6 +68,7 @@ def compute(
         tell: is told how many jobs are computed, with fractions while this process computes a batch.
     """
     planned = batches(flat, least=workers.pieces, most=most, measured=measured)
+    del flat  # half of the memory that settings take
     planned = [batch for batch in planned if not set(finished).issuperset(batch)]
     _log.log(
         logging.DEBUG if measured else logging.INFO,

@@ -116,13 +116,15 @@ def fill(
         def place(index: int) -> Path:
             return directory / FOLDER / str(begin + index)
 
-        for index, outcome, _ in compute(
+        outcomes = compute(
             *(cfgs, flat, place, executor),
             finished=range(rows.written),
             most=most,
             measured=not keep,
             tell=lambda count: tell(begin + count),
-        ):
+        )
+        del flat
+        for index, outcome, _ in outcomes:
             workers.check()
             own = [line for line in overrides[begin + index] if line.partition("=")[0] not in shared]
             row: dict[str, Any] = {"num": begin + index, "overrides": own}
