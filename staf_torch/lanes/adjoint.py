@@ -7,6 +7,7 @@ memory is slower than arithmetic, the backward pass computes it again (`backward
 from __future__ import annotations
 
 import contextlib
+import logging
 import re
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -32,6 +33,9 @@ _WORTH = 10  # operations of a step for each byte of its carry: kept, it costs l
 Plan = PlannedCall | DeviceCall
 _PLANS = 64  # calls of other shapes that are remembered
 _MEBIBYTE = 2**20
+_GROWN = 1e12  # times what a gradient is of, from which on it is reported
+_grown: set[str] = set()  # programs of which that was said
+_log = logging.getLogger(__name__)
 _budget = 256 * _MEBIBYTE
 
 
@@ -335,7 +339,33 @@ class _Gradient(torch.autograd.Function):
         if all(end is None for end in ends):
             return (None,) * (1 + len(needs))
         count = len(needs)
-        return None, *ctx.ran.call.backward(ctx.ran, saved[:count], saved[count:], needs, ends)
+        found = ctx.ran.call.backward(ctx.ran, saved[:count], saved[count:], needs, ends)
+        _warn_where_grown(ctx.ran.call.program.name, ends, found)
+        return None, *found
+
+
+def _warn_where_grown(name: str, ends: Sequence[Tensor | None], found: Sequence[Tensor | None]) -> None:
+    """Log, once a program, gradients in which rounding has grown over the times until nothing else is left.
+
+    On a device, and in `torch.func`, nobody looks: a number would have to be waited for.
+    """
+    gradients = [part.detach() for part in found if part is not None and part.numel()]
+    given = [end.detach() for end in ends if end is not None]
+    wrapped = torch._C._functorch.is_functorch_wrapped_tensor
+    if name in _grown or any(
+        part.is_meta or not part.is_cpu or wrapped(part) for part in (*gradients, *given)
+    ):
+        return
+    came = sum(float(torch.linalg.vector_norm(end, 1)) for end in given)
+    most = max((float(torch.linalg.vector_norm(part, torch.inf)) for part in gradients), default=0.0)
+    if came > 0 and most > _GROWN * came:
+        _grown.add(name)
+        told = (
+            "%s: a gradient of %.1e, %.1e times what it is the gradient of, is made of rounding: the "
+            "recursion amplifies small changes from time to time. Take a law that comes nearer in a step, "
+            "more inner steps, or fewer times (`detach` between them). Said once."
+        )
+        _log.warning(told, name, most, most / came)
 
 
 def carried(compiled: Compiled) -> int:

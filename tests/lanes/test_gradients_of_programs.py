@@ -241,3 +241,14 @@ def test_loops_and_what_is_cut_have_the_gradients_of_the_definition(
     x.data[3] = 0.0
     close(*(gradients(run, given, *more, steps=3) for run in (program, program.definition)), tolerance=1e-10)
     assert "plain torch" not in caplog.text
+
+
+def test_a_gradient_that_rounding_has_overgrown_is_reported_once(caplog: pytest.LogCaptureFixture) -> None:
+    program = lanes.Program(lambda x, now, row: (4 * x * (1 - x), x), name="a chaotic map")
+    for steps, messages in ((20, 0), (100, 1), (100, 1)):
+        x0 = torch.tensor([0.3, 0.6], dtype=torch.float64, requires_grad=True)
+        program(x0, steps=steps)[0].sum().backward()
+        assert (
+            len([text for text in caplog.messages if text.startswith("a chaotic map: a gradient of")])
+            == messages
+        )
