@@ -104,6 +104,8 @@ class Conditions(nn.Module):
         x, t = self._around()
         values = self.margins(x, t).unflatten(0, (len(TIMES), _PROBES))
         self.moving = bool((values != values[:1]).any())
+        if not self.moving:  # one time says it all
+            x, t = x[:_PROBES], t[:_PROBES]
         self.degree = self._degrees(degree, x, t)
         found = _brakes(self, x, t)
         self.braked, self.limited, self.weak, self.apart = (
@@ -340,13 +342,14 @@ def _brakes(of: Conditions, x: Tensor, t: Tensor) -> _Brakes:
     own = torch.where(slope > 0, slope * (bounds.high - rest), slope * (bounds.low - rest))
     sure = torch.where(torch.isfinite(own), own, 0.0).sum(-1)  # of the inputs that have bounds
     none, braked, limited, weak = x.new_tensor(math.inf), [], [], []
+    repeats = len(TIMES) * _PROBES // len(x)  # of a constraint that stands still, one a time
     constant, usual, decays = [], [], []
     for k in range(count):
         value, reach, ability = lean.value[:, k], sure[:, k], lean.ability[:, k]
         inside = (value > 0) & (reach > _NOTHING)
         within = bool(inside.any()) and bool(torch.isfinite(ability).all())
         ratio = torch.where(inside, reach / slopes[:, k], torch.nan)
-        usual.append(known_quantile(ratio, _RARE) if within else none)
+        usual.append(known_quantile(ratio.repeat(repeats), _RARE) if within else none)
         same = within and of.degree[k] == 2 and _same(ability) and _same(lean.slope[:, k])
         good = same and bool(ability[0] > _NOTHING)
         constant.append(ability[0] if good else none)
@@ -372,7 +375,7 @@ def _brakes(of: Conditions, x: Tensor, t: Tensor) -> _Brakes:
 def _decay(value: Tensor, reach: Tensor, inside: Tensor) -> Tensor:
     """Return the decay at which the brakes just stop what is admitted at a usual distance, sqrt(2 reach / h),
     at the time at which it is fastest. A rate that the inputs move themselves is stopped at once."""
-    share = torch.where(inside, reach / value, torch.nan).reshape(len(TIMES), -1)
+    share = torch.where(inside, reach / value, torch.nan).reshape(-1, _PROBES)
     return (2 * torch.nanmedian(share, dim=1).values.nan_to_num(0.0).max()).sqrt()
 
 
@@ -390,21 +393,36 @@ def _apart(lean: Lean, i: int, j: int) -> bool:
 def _is_weak(of: Conditions, k: int, x: Tensor, t: Tensor, usual: Tensor) -> bool:
     """Return whether the bounds cannot hold h at several states of its edge, where h (and h') are 0."""
 
-    def off(x: Tensor, t: Tensor) -> Tensor:
-        return torch.stack(of.level(k, x.unsqueeze(0), t)[: of.degree[k]])
+    def off(x: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+        found = torch.stack(of.level(k, x.unsqueeze(0), t)[: of.degree[k]])
+        return found, found
 
     edge = x
     for _ in range(6):  # Newton's steps of least length
-        value = torch.func.vmap(off)(edge, t)
-        slope = torch.func.vmap(torch.func.jacrev(off))(edge, t)
-        step = (torch.linalg.pinv(torch.nan_to_num(slope)) @ value.unsqueeze(-1)).squeeze(-1)
-        edge = edge - step
-    near = (torch.func.vmap(off)(edge, t).abs() < 1e-6).all(-1) & torch.isfinite(edge).all(-1)
+        slope, value = torch.func.vmap(torch.func.jacrev(off, has_aux=True))(edge, t)
+        edge = edge - _shortest(torch.nan_to_num(slope), value)
+    near = (torch.func.vmap(off)(edge, t)[0].abs() < 1e-6).all(-1) & torch.isfinite(edge).all(-1)
     if not bool(near.any()):
         return False
     (*_, ability) = torch.func.vmap(functools.partial(of.lean, k))(edge.unsqueeze(1), t)
     short = near & (ability < 1e-3 * usual * (of.degree[k] == 2))
     return bool(short.double().sum() / near.double().sum() > _SEVERAL)
+
+
+def _shortest(rows: Tensor, value: Tensor) -> Tensor:
+    """Return the shortest solution of one or two linear equations, least squares where they depend on each
+    other: (P, d, n), (P, d) -> (P, n)."""
+    gram = rows @ rows.mT
+    square = gram.diagonal(dim1=-2, dim2=-1)
+    size = square.sum(-1, keepdim=True)
+    share = value / torch.where(size > 0, size, 1.0)
+    if rows.shape[-2] == 2:
+        product, mixed = square.prod(-1, keepdim=True), gram[:, 0, 1:]
+        determinant = product - mixed.square()
+        apart = determinant > 8 * torch.finfo(rows.dtype).eps * product
+        both = square.flip(-1) * value - mixed * value.flip(-1)
+        share = torch.where(apart, both / torch.where(apart, determinant, 1.0), share)
+    return (rows.mT @ share.unsqueeze(-1)).squeeze(-1)
 
 
 def _speed(rate: Tensor) -> Tensor:

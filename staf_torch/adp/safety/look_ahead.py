@@ -283,8 +283,7 @@ def opposition(of: Conditions, policy: Policy | None) -> Opposed:
         return none
     modes = torch.linalg.eigvals(closed)
     alone, fast = None if policy is None else modes.real.max(), modes.abs().max()
-    if alone is not None and bool(alone > _UNSTABLE * fast):
-        return none  # the policy brings nothing back by itself
+    lost = torch.zeros_like(fast > 0) if alone is None else alone > _UNSTABLE * fast  # nothing comes back
     rates = list[Tensor]()
     x, _ = of._around()
     normals = [torch.func.vmap(torch.func.grad(lambda x, h=h: h(x.unsqueeze(0), x.new_zeros(()))[0]))
@@ -293,7 +292,7 @@ def opposition(of: Conditions, policy: Policy | None) -> Opposed:
         grown = torch.stack([_growth(c, a, b, closed, of.decay[k], of.degree[k]) for c in normal(x[:8])])
         known = grown == grown
         middle = grown.sort().values.gather(0, known.sum().unsqueeze(0) // 2 % len(grown))[0]
-        rates.append(torch.where(known.any() & (middle > 0), middle, 0.0))
+        rates.append(torch.where(known.any() & (middle > 0) & ~lost, middle, 0.0))
     rate = torch.stack(rates)
     bowl = None
     if alone is not None and bool((rate > 0).any()) and bool(alone < 0):
