@@ -17,5 +17,7 @@ def fail(call: str, name: str, rule: str, value: object) -> ValueError:
 def show(value: object) -> str:
     """A value as the user wrote it; of a large tensor its shape alone."""
     if hasattr(value, "numel") and hasattr(value, "tolist"):  # a tensor; an array has no numel
+        if hasattr(value, "full"):  # numbers of rows
+            return f"rows({show(value.full)})"
         return repr(value.tolist()) if value.numel() <= 8 else f"a tensor {tuple(value.shape)}"  # type: ignore[attr-defined]
     return repr(value)

@@ -39,7 +39,8 @@ def number(call: str, name: str, value: object) -> float | Tensor:
 def real(call: str, name: str, value: object) -> float:
     """A finite Python number."""
     if isinstance(value, Tensor):
-        raise fail(call, name, "must be a number", value)
+        several = isinstance(value, RowNumbers)
+        raise fail(call, name, "must be one number for all rows" if several else "must be a number", value)
     checked = number(call, name, value)
     assert isinstance(checked, float)
     return checked

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ..lanes.gradients import refuse_gradient
 from ..lanes.row_decisions import in_any_row
+from ..lanes.row_objects import by_rows
 from ..numerics.checks import object_of
 from ..numerics.differences import central_slopes
 from ..signs import Sign
@@ -88,6 +89,7 @@ class Equilibrium(NamedTuple):
 
 
 @Sign("find_equilibrium")
+@by_rows
 def find_equilibrium(
     plant: Plant, x: Sequence[float] | Tensor, u: Sequence[float] | Tensor | None = None
 ) -> Equilibrium:

@@ -13,7 +13,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from ...lanes.row_numbers import over_some_rows
+from ...lanes.row_numbers import over_rows, over_some_rows
 from ...numerics.exponential_step import GRACE, MOST, TOLERANCE, TRIED, StepsNeeded, needed_steps
 from ..problem.held_plant import Holding
 
@@ -98,7 +98,7 @@ def warn_of_models(controller: nn.Module, x: Tensor, u: Tensor) -> None:
             continue
         if holding.plant.dim != x.shape[-1] or not bool(known.any()):
             continue
-        found = holding.errors(x[known], u[known])
+        found = torch.where(known, over_rows(holding.errors, x, u.nan_to_num(0.0)), 0.0)
         if float(found.max()) > _MODELS * TOLERANCE:
             _log.warning(
                 "`simulate`: the model of %s, %d integration steps in %.4g s, is wrong by up to %.2g of the "

@@ -228,7 +228,7 @@ class _LoopRun:
             states, controls = rows_of(result.state, at), rows_of(result.control, at)
             moves = hardest(loop.holding, states, controls, rest, frozen)
             found = needed(loop.holding, *moves, frozen)
-        warn_of_models(loop.controller, *moves)
+            warn_of_models(loop.controller, *moves)
         if not again:
             with torch.no_grad(), some_rows(at):
                 one = needed(loop.holding, *moves, torch.ones_like(frozen), most=1)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 
+from ...lanes.row_numbers import all_rows, over_rows, points_of_rows
+from ...lanes.row_objects import made_by_rows
 from ...numerics.checks import choice, fail, integer, object_of, positive_real
 from ...numerics.linalg import Matrix
 from ...numerics.row_checks import check_rows
@@ -56,6 +58,8 @@ class AvoidanceCost(QuadraticCost):
 
     Source: Deptula, Chen, Licitra, Rosenfeld, Dixon, IEEE T-RO 36 (2020).
     """
+
+    rowwise: ClassVar = {"penalty": (0,), "outside": (1,)}
 
     def __init__(
         self,
@@ -175,30 +179,37 @@ def plan_around(
     if not shrink:
         raise fail("plan_around", "shrink", "must have at least one share", shrink)
     cost = copy.deepcopy(cost)  # its weight is going to change
-    first = float(cost.weight)
+    weight = all_rows(cost.weight)
+    first = weight.clone()
     free = QuadraticCost(cost.q, cost.r, cost.dim, cost.inputs)
     problem = SampledProblem.of(plant, cost, dt=dt)
-    ways = problem.levels()
-    rows = x0.repeat_interleave(len(ways), dim=0)
-    away = (ways - problem.rest).repeat(len(x0), 1)
-    pushed = torch.arange(steps, device=x0.device) < steps // 4
-    control: Tensor = problem.rest + torch.where(pushed[:, None], away.unsqueeze(1), 0.0)
-    gains = (-problem.k).expand(len(rows), steps, -1, -1)
-    around = Reference(problem.goal.expand(len(rows), steps, -1), gains)
+    ways = made_by_rows(problem.levels)
+    count, pushed = len(ways), torch.arange(steps, device=x0.device) < steps // 4
+
+    def guesses(x: Tensor) -> tuple[Tensor, ...]:
+        away = torch.where(pushed[:, None], (ways - problem.rest).unsqueeze(1), 0.0)
+        many = len(x), count, steps
+        goal, gains = problem.goal.expand(*many, -1), (-problem.k).expand(*many, -1, -1)
+        return (problem.rest + away).expand(*many, -1), goal, gains
+
+    rows = x0.repeat_interleave(count, dim=0)
+    control, *along = (part.flatten(0, 1) for part in over_rows(guesses, x0))
+    around = Reference(*along)
     bare = SampledProblem.of(plant, free, dt=dt, low=problem.bounds.low, high=problem.bounds.high)
     best: AvoidancePlans | None = None
-    for share in shrink:
-        cost.weight.fill_(first * positive_real("plan_around", "shrink", share))
-        cost.edge.fill_(_EDGE * math.sqrt(share))
-        search = BoxDDP(problem, steps=steps, iterations=iterations, compile=compile)
-        found = search.solve(rows, control, around)
-        control, around = found.control, Reference(found.state[:, :-1], found.feedback)
-        _, paid = bare.advance(found.state[:, :-1], found.control)
-        total = paid.sum(1) + bare.terminal(found.state[:, -1])
-        margin = cost.outside(found.state).amin(-1)
-        total = torch.where((margin >= 0) & torch.isfinite(total), total, torch.inf)
-        now = AvoidancePlans(found, total, margin)
-        best = now if best is None else best.or_cheaper(now)
+    with points_of_rows(len(x0), count):
+        for share in shrink:
+            weight.copy_(first * positive_real("plan_around", "shrink", share))
+            cost.edge.fill_(_EDGE * math.sqrt(share))
+            search = BoxDDP(problem, steps=steps, iterations=iterations, compile=compile)
+            found = search.solve(rows, control, around)
+            control, around = found.control, Reference(found.state[:, :-1], found.feedback)
+            _, paid = bare.advance(found.state[:, :-1], found.control)
+            total = paid.sum(1) + bare.terminal(found.state[:, -1])
+            margin = cost.outside(found.state).amin(-1)
+            total = torch.where((margin >= 0) & torch.isfinite(total), total, torch.inf)
+            now = AvoidancePlans(found, total, margin)
+            best = now if best is None else best.or_cheaper(now)
     assert best is not None
-    chosen = best.cost.reshape(len(x0), -1).argmin(-1) + torch.arange(len(x0), device=x0.device) * len(ways)
+    chosen = best.cost.reshape(len(x0), -1).argmin(-1) + torch.arange(len(x0), device=x0.device) * count
     return AvoidancePlans(rows_of(best.trajectories, chosen), best.cost[chosen], best.margin[chosen])

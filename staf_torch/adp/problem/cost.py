@@ -183,6 +183,7 @@ class Cost(nn.Module, metaclass=OfRows):
         self.target_input = None if self.target_input is None else self.target_input.to(device)
         return moved
 
+    @by_rows
     def bounded(self, low: Limit, high: Limit) -> Self:
         """This cost with other bounds of the inputs; the same where both are None."""
         if low is None and high is None:
