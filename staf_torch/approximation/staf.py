@@ -12,6 +12,7 @@ from torch.nn.utils import parametrize
 
 from ..lanes.gradients import refuse_gradient
 from ..lanes.one_thread import alone
+from ..lanes.row_objects import refuse_rows
 from ..numerics.checks import beside_batch, choice, fail, flag, hold, integer, trailing
 from ..numerics.default_device import beside
 from ..numerics.linalg import row_jacobian
@@ -72,6 +73,7 @@ class StaF(nn.Module):
         super().__init__()
         if not isinstance(basis, StaFBasis):
             raise fail("StaF", "basis", "must be a StaFBasis", basis)
+        refuse_rows("StaF", "`StaFBasis.ideal_weights` serves them", basis=basis)
         if out_features is not None:
             integer("StaF", "out_features", out_features, least=1)
         self.basis = basis

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
+from ..lanes.row_objects import by_rows
 from ..numerics.angles import wrap
 from ..numerics.checks import fail, hold, numbers_of, states
 from .base import ControlAffineSystem, Linearisation, Units
@@ -52,6 +54,10 @@ class Barrier(ControlAffineSystem):
 
     Source: Mahmud et al., Front. Robot. AI 8 (2021), eq. (2), around 0; here around the equilibrium.
     """
+
+    rowwise: ClassVar = dict.fromkeys(
+        ("coordinates", "transform", "inverse", "margin", "stretch", "walls"), (1,)
+    )
 
     def __init__(self, plant: ControlAffineSystem, low: Wall, high: Wall) -> None:
         if not isinstance(plant, ControlAffineSystem) or plant.dim is None:
@@ -177,6 +183,7 @@ class Barrier(ControlAffineSystem):
         low, high = torch.where(rate < 0, -down / rate, none), torch.where(rate > 0, up / rate, none)
         return 0.5 * torch.minimum(low, high).amin(-1)
 
+    @by_rows
     def linearisation(self, x: Tensor | None = None, u: Tensor | None = None) -> Linearisation:
         """D A D^-1 and D B with D = ds/dx, near a state of rest s and an input."""
         s = self.equilibrium() if x is None else x

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from ..lanes.row_decisions import in_any_row
 from ..lanes.row_numbers import RowNumbers, value_of
-from ..lanes.row_objects import OfRows
+from ..lanes.row_objects import OfRows, by_rows
 from ..numerics.angles import wrap
 from ..numerics.checks import trailing
 from ..numerics.default_device import device_of
@@ -240,6 +240,7 @@ class ControlAffineSystem(Plant):
     def motion(self, x: Tensor, u: Tensor) -> Tensor:
         return self.rate(x, u)
 
+    @by_rows
     def linearisation(self, x: Tensor | None = None, u: Tensor | None = None) -> Linearisation:
         """A = d(f + g u)/dx and B = g at rest, by automatic differentiation."""
         at = value_of(self.equilibrium() if x is None else x)

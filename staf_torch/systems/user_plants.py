@@ -10,6 +10,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from ..lanes.row_objects import by_rows
 from ..numerics.checks import fail, integer, numbers_of, positive_real, vector
 from ..numerics.default_device import beside
 from .base import Linearisation, Plant
@@ -84,6 +85,7 @@ class FunctionPlant(Plant):
     def resting_input(self) -> Tensor:
         return self._rest[1]
 
+    @by_rows
     def linearisation(self, x: Tensor | None = None, u: Tensor | None = None) -> Linearisation:
         at = self._rest[0] if x is None else x
         return self.function.linearisation(at, self._rest[1] if u is None else u, self._apart)

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ..centers.layouts import monomials
+from ..lanes.row_objects import refuse_rows
 from ..numerics.checks import fail, integer, positive_real, sampled, trailing
 from ..signs import Sign
 from .uniform_approximation import ball_grid, near_best, supremum
@@ -281,6 +282,7 @@ def exponential_bound(
 
     Source: Rosenfeld et al., section 4; MATH.md section 3 has its misprints.
     """
+    refuse_rows("exponential_bound", target=target)
     problem = _problem("exponential_bound", target, domain, radius, epsilon, max_degree)
     with torch.no_grad():
         value, exponential = problem.factors()
@@ -319,6 +321,7 @@ def one_polynomial_bound(
     Raises:
         ValueError: as `exponential_bound`.
     """
+    refuse_rows("one_polynomial_bound", target=target)
     problem = _problem("one_polynomial_bound", target, domain, radius, epsilon, max_degree)
     with torch.no_grad():
         return problem.one_polynomial()

@@ -15,6 +15,7 @@ from torch import Tensor
 from ..approximation.basis import StaFBasis
 from ..centers import StateFollowingCenters, ball, polygon, rings
 from ..kernels import Kernel
+from ..lanes.row_objects import refuse_rows
 from ..local_basis import GradedBasis, GradedSpace, LocalSpace, newton_space, phi
 from ..numerics.checks import fail, positive_real, trailing
 from ..signs import Sign
@@ -101,6 +102,7 @@ def minimal_count(
     Source: the feasibility theorem of Rosenfeld et al., section 3, and the proposition after it (in the
     supremum norm): such an M exists. Here it is measured.
     """
+    refuse_rows("minimal_count", target=target, kernel=kernel, radius=radius)
     call = "minimal_count"
     trailing(call, "states", states, dims=1)
     allowed = positive_real(call, "epsilon", epsilon)
@@ -156,6 +158,7 @@ def layout_errors(
     Raises:
         ValueError: if an argument breaks its rule.
     """
+    refuse_rows("layout_errors", target=target, kernel=kernel, radius=radius)
     call = "layout_errors"
     trailing(call, "states", states, dims=1)
     extent = positive_real(call, "radius", radius)
@@ -227,6 +230,7 @@ def power_function(basis: StaFBasis, x: Tensor, z: Tensor, *, relative: bool = F
     Source: Schaback, "Error estimates and condition numbers for radial basis function interpolation",
     Adv. Comput. Math. 3 (1995).
     """
+    refuse_rows("power_function", basis=basis)
     trailing("power_function", "x", x, dims=1, last=basis.dim)
     trailing("power_function", "z", z, dims=2, last=basis.dim)
     space = basis.local(x)

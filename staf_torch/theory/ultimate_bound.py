@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ..approximation.basis import StaFBasis, Target
 from ..engine import along, gram_rates
+from ..lanes.row_objects import refuse_rows
 from ..numerics.checks import fail, integer, positive_real, trailing
 from ..numerics.linalg import condition_number
 from ..optim import SteepestDescent, UpdateLaw
@@ -78,6 +79,7 @@ def drift_constants(basis: StaFBasis, target: Target, states: Tensor, velocities
     Raises:
         ValueError: if the shapes differ, or K is numerically singular at one of the states.
     """
+    refuse_rows("drift_constants", basis=basis, target=target)
     trailing("drift_constants", "states", states, dims=1, last=basis.dim)
     if velocities.shape != states.shape:
         raise ValueError(
@@ -294,6 +296,7 @@ def paper_step(
 
     Source: Rosenfeld et al., section 6; MATH.md, section 2.
     """
+    refuse_rows("paper_step", basis=basis, target=target)
     positive_real("paper_step", "excess", excess)
     trailing("paper_step", "states", states, dims=2, last=basis.dim)
     centers, moving = along(basis.centers, states, velocities)

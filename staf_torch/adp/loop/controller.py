@@ -325,6 +325,8 @@ class Supervised(Controller):
         ValueError: if ``trust`` is not in (0, 1].
     """
 
+    rowwise: ClassVar = {"restrain": (1, 1)}
+
     def __init__(self, controller: Controller, lqr: LQR, cost: Cost, trust: float = 0.5) -> None:
         super().__init__()
         if not 0 < real("Supervised", "trust", trust) <= 1:
