@@ -164,6 +164,54 @@ def drift(**settings: Any) -> Run:
     return loop(adp.DriftLQR(found, PENDULUM_COST, doublings=3), PENDULUM, PENDULUM_COST)
 
 
+def robust(wall: Any = 0.9, **settings: Any) -> Run:
+    plant = adp.ParametricPlant.of_effectiveness(PENDULUM)
+    law, windows = adp.LeastSquares([1.05], deviation=0.2), adp.IntegralWindows(plant, 0.1, first=0.03)
+    box = {"theta_low": [0.6], "theta_high": [1.5], "decay": 4.0, **settings}
+    wanted = adp.Feedback(lambda x: -10 * (x[..., :1] - 1.0) - 3 * x[..., 1:])
+    safe = adp.RobustFilter(wanted, plant, lambda x, t: wall - x[:, 0], windows, law, dt=0.02, **box)
+    return loop(safe, plant, PENDULUM_COST)
+
+
+def changing(mass: Any = 1.0, before: Any = (1.0,), after: Any = (0.5,)) -> Run:
+    plant = adp.ChangingPlant(adp.ParametricPlant.of_effectiveness(systems.Pendulum(mass)))
+
+    def run(rows: slice, real: torch.dtype) -> Any:
+        return systems.simulate(plant, plant.start(X0[rows].to(real), before, after, 0.015), dt=0.01, steps=3)
+
+    return run
+
+
+def referred(error: Any = 10.0, gain: Any = 5.0) -> Run:
+    plant, cost = systems.TwoStateTracking(), adp.tracking_cost(error, 1.0)
+    basis = adp.LeadingCoordinates(adp.QuadraticBasis(2), 4)
+    learner = adp.ActorCritic(basis, plant, cost, adp.RandomPoints(1, 0.3))
+    identifier = adp.ConcurrentLearning(3, 2, 6, gain=gain)
+    tracker = adp.IdentifyingTracker(learner, plant, identifier, torch.zeros(3, 2).double())
+    z0 = torch.cat((0.3 * X0, torch.tensor([[0.0, 1.0]]).expand(ROWS, 2)), dim=-1)
+    return lambda rows, real: (
+        adp.simulate(
+            tracker, plant, cost, z0[rows].to(real), dt=0.01, steps=3, seed=[*range(ROWS)][rows]
+        ).state
+    )
+
+
+def avoided(spot: Any = (0.8, 0.8), weight: Any = 1.0, bound: Any = 1.0) -> Run:
+    robot, at = (
+        systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]]),
+        torch.as_tensor(spot, dtype=torch.float64),
+    )
+
+    def disc(x: Tensor) -> Tensor:
+        return (x - at.to(x)).square().sum(-1) - 0.04
+
+    box = {"obstacles": disc, "reach": 0.3, "weight": weight, "low": -1.0, "high": bound}
+    cost, few = adp.AvoidanceCost(1.0, 1.0, 2, 1, **box), {"shrink": [1.0], "iterations": 1, "compile": False}
+    return lambda rows, real: tuple(
+        adp.plan_around(robot, cost, X0[rows].to(real), dt=0.1, steps=4, **few)[1:]
+    )
+
+
 class Gained(adp.Controller):
     """A user's controller, whose number is an attribute."""
 
@@ -221,6 +269,10 @@ CASES: dict[str, Case] = {
             "inertia": ([3.473, 0.196, 0.242], [3.5, 0.2, 0.2]),
         },
         lambda **n: trajectory(systems.TwoLinkRobot(**n)),
+    ),
+    "points of a barrier": Case(
+        {"low": ([-2.0, -9.0], [-3.0, -8.0])},
+        lambda low: lambda rows, real: systems.Barrier(TWO, low, [2.0, 9.0]).inverse(X0[rows].to(real)),
     ),
     "barrier": Case(
         {"low": ([-7.0, -6.0], [-6.0, -7.0]), "high": ([5.0, 7.0], [6.0, 7.0])},
@@ -409,6 +461,15 @@ CASES: dict[str, Case] = {
         1e-9,
     ),
     # what plans and guards
+    "identifying_tracker": Case({"error": (5.0, 10.0), "gain": (4.0, 5.0)}, referred),
+    "changing_plant": Case({"mass": (0.8, 1.2), "before": ([0.8], [1.2]), "after": ([0.4], [0.6])}, changing),
+    "robust_filter": Case(
+        {"wall": (0.8, 0.9), "confidence": (3.0, 4.0), "margin": (0.0, 0.1), "theta_high": ([1.4], [1.5])},
+        robust,
+    ),
+    "plan_around": Case(
+        {"spot": ([0.8, 0.8], [0.9, 0.7]), "weight": (1.0, 2.0), "bound": (0.8, 1.0)}, avoided
+    ),
     "path_integral": Case(
         {"mass": (0.8, 1.2), "noise": (0.3, 0.5), "temperature": (0.1, 0.2)}, lambda **n: sampled(**n)
     ),

@@ -495,3 +495,23 @@ def test_a_users_function_may_read_numbers_of_rows_wherever_torch_takes_numbers(
             run((), (), x, steps=1)[1][:, 0], torch.cat(singles), rtol=1e-14, atol=1e-14
         )
     assert program.compiled == (name not in ("new_full", "branch"))  # which want a Python number
+
+
+def test_equilibria_and_bounds_beside_a_cost_take_rows_and_theorems_refuse_them() -> None:
+    pushes, bounds = spread(0.1, 0.3), spread(1.0, 2.0)
+    resting = [
+        systems.find_equilibrium(systems.RatePlant(lambda x, u, c=c: c - x + u, dim=1, inputs=1), [0.0])
+        for c in pushes
+    ]
+    c = st.rows(pushes)
+    many = systems.find_equilibrium(systems.RatePlant(lambda x, u: c - x + u, dim=1, inputs=1), [0.0])
+    assert torch.equal(many.input.full, torch.stack([rest.input for rest in resting]))
+    cost, plant = adp.QuadraticCost(1.0, 1.0, 2, 1), systems.Pendulum()
+    limited = adp.SampledProblem.of(plant, cost, dt=0.1, low=-1.0, high=st.rows(bounds))
+    assert torch.equal(limited.bounds.high.full[:, 0], bounds)
+    with pytest.raises(ValueError, match=r"`BoxDDP\(tolerance=...\)` must be one number for all rows"):
+        adp.BoxDDP(limited, steps=4, tolerance=st.rows(bounds))
+    with pytest.raises(
+        ValueError, match=r"`layout_errors\(radius=...\)` must have no numbers of a row's own"
+    ):
+        st.theory.layout_errors(st.targets.Paper(), st.GaussianKernel(), starts(3), c, [st.rings(3)])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -241,6 +241,8 @@ class ChangingPlant(ControlAffineSystem):
     Args:
         model: the plant.
     """
+
+    rowwise: ClassVar = {"start": (1, 1, 1, 0), "theta": (1,)}
 
     def __init__(self, model: ParametricPlant) -> None:
         super().__init__()

@@ -133,7 +133,8 @@ class RobustFilter(Controller):
         trailing(type(self).__name__, "x0", x0, 2)
         zero, inner = x0.new_zeros(len(x0)), self.controller.init(x0)
         estimate, window = self.law.init(x0), self.windows.init(x0)
-        return Guarded(inner, estimate, window, zero, torch.full_like(zero, _FAR), zero.clone(), zero.clone())
+        unseen = torch.full_like(zero, min(_FAR, torch.finfo(zero.dtype).max))
+        return Guarded(inner, estimate, window, zero, unseen, zero.clone(), zero.clone())
 
     def recorded(self, carried: Guarded) -> dict[str, Tensor]:
         own = {name: getattr(carried, name) for name in Guarded._fields[-3:]}
