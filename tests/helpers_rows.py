@@ -468,7 +468,7 @@ CASES: dict[str, Case] = {
         robust,
     ),
     "plan_around": Case(
-        {"spot": ([0.8, 0.8], [0.9, 0.7]), "weight": (1.0, 2.0), "bound": (0.8, 1.0)}, avoided
+        {"spot": ([0.8, 0.8], [0.9, 0.7]), "weight": (1.0, 2.0), "bound": (0.8, 1.0)}, avoided, 1e-13
     ),
     "path_integral": Case(
         {"mass": (0.8, 1.2), "noise": (0.3, 0.5), "temperature": (0.1, 0.2)}, lambda **n: sampled(**n)
