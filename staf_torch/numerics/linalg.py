@@ -287,3 +287,19 @@ def length(a: Tensor, b: Tensor) -> Tensor:
     """Return sqrt(a^2 + b^2); its derivative at 0 is 0."""
     zero = (a == 0) & (b == 0)
     return torch.where(zero, 0.0, torch.hypot(torch.where(zero, 1.0, a), b))
+
+
+def shortest_solution(rows: Tensor, value: Tensor) -> Tensor:
+    """Return the shortest solution of one or two linear equations, least squares where they depend on each
+    other: (P, d, n), (P, d) -> (P, n)."""
+    gram = rows @ rows.mT
+    square = gram.diagonal(dim1=-2, dim2=-1)
+    size = square.sum(-1, keepdim=True)
+    share = value / torch.where(size > 0, size, 1.0)
+    if rows.shape[-2] == 2:
+        product, mixed = square.prod(-1, keepdim=True), gram[:, 0, 1:]
+        determinant = product - mixed.square()
+        apart = determinant > 8 * torch.finfo(rows.dtype).eps * product
+        both = square.flip(-1) * value - mixed * value.flip(-1)
+        share = torch.where(apart, both / torch.where(apart, determinant, 1.0), share)
+    return (rows.mT @ share.unsqueeze(-1)).squeeze(-1)

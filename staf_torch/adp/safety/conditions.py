@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from ...numerics.checks import fail, non_negative, one_or_each, positive, trailing
 from ...numerics.default_device import device_of
+from ...numerics.linalg import shortest_solution
 from ...numerics.quantiles import known_quantile
 from ...numerics.row_checks import check_rows
 from ...numerics.runge_kutta import runge_kutta_step
@@ -400,29 +401,13 @@ def _is_weak(of: Conditions, k: int, x: Tensor, t: Tensor, usual: Tensor) -> boo
     edge = x
     for _ in range(6):  # Newton's steps of least length
         slope, value = torch.func.vmap(torch.func.jacrev(off, has_aux=True))(edge, t)
-        edge = edge - _shortest(torch.nan_to_num(slope), value)
+        edge = edge - shortest_solution(torch.nan_to_num(slope), value)
     near = (torch.func.vmap(off)(edge, t)[0].abs() < 1e-6).all(-1) & torch.isfinite(edge).all(-1)
     if not bool(near.any()):
         return False
     (*_, ability) = torch.func.vmap(functools.partial(of.lean, k))(edge.unsqueeze(1), t)
     short = near & (ability < 1e-3 * usual * (of.degree[k] == 2))
     return bool(short.double().sum() / near.double().sum() > _SEVERAL)
-
-
-def _shortest(rows: Tensor, value: Tensor) -> Tensor:
-    """Return the shortest solution of one or two linear equations, least squares where they depend on each
-    other: (P, d, n), (P, d) -> (P, n)."""
-    gram = rows @ rows.mT
-    square = gram.diagonal(dim1=-2, dim2=-1)
-    size = square.sum(-1, keepdim=True)
-    share = value / torch.where(size > 0, size, 1.0)
-    if rows.shape[-2] == 2:
-        product, mixed = square.prod(-1, keepdim=True), gram[:, 0, 1:]
-        determinant = product - mixed.square()
-        apart = determinant > 8 * torch.finfo(rows.dtype).eps * product
-        both = square.flip(-1) * value - mixed * value.flip(-1)
-        share = torch.where(apart, both / torch.where(apart, determinant, 1.0), share)
-    return (rows.mT @ share.unsqueeze(-1)).squeeze(-1)
 
 
 def _speed(rate: Tensor) -> Tensor:
