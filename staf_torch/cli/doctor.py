@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import platform
 import shutil
-import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -26,6 +25,7 @@ from ..optim import SteepestDescent
 from ..results.build import installed
 from ..systems import Oscillator, simulate
 from ..targets import Paper
+from .printing import printed
 
 _PACKAGES = ("torch", "numpy", "hydra-core", "omegaconf", "matplotlib", "scipy", "pandas", "pyarrow")
 _EXPECTED = 6.23712254984
@@ -43,7 +43,7 @@ def main(words: Sequence[str] = ()) -> int:
         raise ValueError(f"`staf doctor` takes no arguments; got {words[0]!r}.")
     sound = True
     for name, found, good in _findings():
-        sys.stdout.write(f"{name + ':':<12}{found}{'' if good else '   <- problem'}\n")
+        printed(f"{name + ':':<12}{found}{'' if good else '   <- problem'}\n")
         sound = sound and good
     return 0 if sound else 1
 

@@ -26,6 +26,7 @@ from ..results.untrusted import visible
 from ..settings.chase import DTYPES
 from ..signs import Sign
 from .deployable import CarriesPlanError, Deployable, Learner, deployable, learning
+from .printing import printed
 
 _PORTS = ("state", "control", "value", "gradient", "x", "u", "uniform")  # names of inputs and outputs
 ENDINGS = {"onnx": ".onnx", "pt2": ".pt2", "aoti": ".aoti.pt2", "c": ".h"}
@@ -316,4 +317,4 @@ def main(arguments: list[str] | None = None) -> None:
             page = export_learning(**given)
     except (ValueError, OSError) as error:
         sys.exit(f"staf-export: {visible(str(error))}")
-    sys.stdout.write(sheet.markdown(page))
+    printed(sheet.markdown(page))

@@ -20,6 +20,7 @@ from ..results.build import source
 from ..settings import config_directory
 from ..signs import Sign
 from ..sweeps.hydra_compat import VERSION, find_launcher, full_errors, is_about_settings, program
+from .printing import printed
 
 find_launcher()
 _PARTS = {
@@ -50,7 +51,7 @@ def main() -> None:
     if words and re.fullmatch(r"[A-Za-z_]\w*", words[0]):  # Hydra's grammar would say what is missing at EOF
         sys.exit(f"staf: {_unknown(words[0])}")
     if words in (["--help"], ["-h"]):
-        sys.exit(print(_help()))
+        sys.exit(printed(f"{_help()}\n"))
     try:
         if not any(word.startswith("sweep.resume=") for word in words) and is_about_settings(words):
             with full_errors():
@@ -88,7 +89,7 @@ def _ended(part: Callable[[list[str]], str | int], words: list[str]) -> str | in
         found = part(words)
     except ValueError as error:
         return f"staf: {error}"
-    return found if isinstance(found, int) else print(found)
+    return found if isinstance(found, int) else printed(f"{found}\n")
 
 
 def _unknown(word: str) -> str:

@@ -17,6 +17,7 @@ from ..tables import Layout, Print, Style, Table, json_text, latex_text, parquet
 from ..tables.aggregate import AGGREGATES
 from ..tables.latex import parts
 from ..tables.model import escaped
+from .printing import printed
 
 
 def markdown_text(table: Table, about: Print) -> str:
@@ -77,7 +78,7 @@ def _once(options: argparse.Namespace) -> int:
             print(f"note: {remark}", file=sys.stderr)
         content = _rendered(found, options)
         if options.output is None:
-            sys.stdout.write(content.decode())
+            printed(content.decode())
         else:
             write_bytes(options.output, content)
     except (ValueError, OSError) as error:

@@ -44,6 +44,19 @@ def test_version_is_printed_with_a_hash_of_the_source(staf: Any) -> None:
     assert said == f"staf_torch {__version__} (source {source()})\n"
 
 
+def test_a_reader_may_stop_early(tmp_path: Path) -> None:
+    write_sweep(tmp_path)
+    tables = "import sys; from staf_torch.cli.table import main; sys.exit(main())"
+    for words in (["-m", "staf_torch", "schema"], ["-c", tables, str(tmp_path), "--format", "csv"]):
+        started = subprocess.Popen(
+            [sys.executable, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        assert started.stdout is not None
+        started.stdout.close()
+        assert "ipe" not in started.communicate()[1]
+        assert started.returncode == 0
+
+
 def test_the_doctor_finds_this_machine_sound(staf: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     code, said = staf("doctor")
