@@ -141,35 +141,35 @@ static thread_local Memory memory;
 static thread_local Memory made;
 struct Remade {
     const Call &call;
-    const Again &again;
+    const Again *again;  // null: none
     Slot *now, *slots;  // of this program's inputs of times, and of all of the other's
     REAL **now_data, **data;
 
     void begin(REAL *const *from, int64_t tile) {
         int64_t numbers = 0;
         for (int s = 0; s < SLOTS_NOW; ++s) now[s] = call.slots[SLOTS_ROW + s], now_data[s] = from[SLOTS_ROW + s];
-        for (int64_t s = 0; s < again.inputs + again.results; ++s) slots[s] = again.call->slots[s];
-        for (int64_t k = 0; k < again.results; ++k) {
-            Slot &slot = slots[again.inputs + k];
-            const int64_t size = slot.entries * tile, here = again.to[k];
+        for (int64_t s = 0; s < again->inputs + again->results; ++s) slots[s] = again->call->slots[s];
+        for (int64_t k = 0; k < again->results; ++k) {
+            Slot &slot = slots[again->inputs + k];
+            const int64_t size = slot.entries * tile, here = again->to[k];
             slot = {1, here < 0 ? 0 : size, tile, slot.entries};
             if (here >= 0) now[here] = {1, -size, tile, slot.entries};
             numbers += here < 0 ? size : size * call.times;
         }
         REAL *to = made.of(numbers);
-        for (int64_t k = 0; k < again.results; ++k) {
-            data[again.inputs + k] = to;
-            to += slots[again.inputs + k].entries * tile * (again.to[k] < 0 ? 1 : call.times);
+        for (int64_t k = 0; k < again->results; ++k) {
+            data[again->inputs + k] = to;
+            to += slots[again->inputs + k].entries * tile * (again->to[k] < 0 ? 1 : call.times);
         }
     }
     void run(int64_t first, int rows) {
-        Call part = *again.call;
+        Call part = *again->call;
         part.rows = rows, part.slots = slots, part.parallel = nullptr;
-        for (int64_t s = 0; s < again.inputs; ++s) data[s] = again.data[s] + first * slots[s].row;
-        for (int64_t k = 0; k < again.results; ++k)
-            if (again.to[k] >= 0)
-                now_data[again.to[k]] = data[again.inputs + k] + (call.times - 1) * slots[again.inputs + k].time - first;
-        again.run(&part, data, 1);
+        for (int64_t s = 0; s < again->inputs; ++s) data[s] = again->data[s] + first * slots[s].row;
+        for (int64_t k = 0; k < again->results; ++k)
+            if (again->to[k] >= 0)
+                now_data[again->to[k]] = data[again->inputs + k] + (call.times - 1) * slots[again->inputs + k].time - first;
+        again->run(&part, data, 1);
     }
 };
 
@@ -191,7 +191,7 @@ struct Work {
         const int64_t others = call.again ? call.again->inputs + call.again->results : 0;
         Slot made_slots[SLOTS_NOW + others + 1];
         REAL *made_data[SLOTS_NOW + others + 1];
-        Remade remade{call, *call.again, made_slots, made_slots + SLOTS_NOW, made_data, made_data + SLOTS_NOW};
+        Remade remade{call, call.again, made_slots, made_slots + SLOTS_NOW, made_data, made_data + SLOTS_NOW};
         if (call.again) remade.begin(data, tile), now = made_slots, now_data = made_data;
         Frame f;
         f.fixed = memory.of(numbers + lanes), f.carry = f.fixed + (ROWS + FIXED) * room, f.now = f.carry + CARRIES * room;

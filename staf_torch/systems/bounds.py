@@ -53,7 +53,7 @@ class Bounds:
     @property
     def present(self) -> bool:
         """Return whether any input is bounded."""
-        return bool(torch.isfinite(self.low).any() or torch.isfinite(self.high).any())
+        return any(bool(torch.isfinite(all_rows(limit)).any()) for limit in (self.low, self.high))
 
     def clip(self, u: Tensor) -> Tensor:
         """The nearest admissible input: (..., m) -> (..., m)."""

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 import torch
 from figures.drawing import lines, visible
+from helpers import tensor
 from torch import Tensor
 
-from staf_torch import adp, systems
+from staf_torch import adp, rows, systems
 from staf_torch.figures.style import page
 
 pytest.importorskip("scipy", reason="the LQR needs the extra adp")
@@ -161,3 +162,14 @@ def test_a_loop_without_an_lqr_says_why_and_is_drawn(caplog: pytest.LogCaptureFi
 def test_what_a_picture_cannot_be_is_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         run(pendulum).figure(lqr=False, **options)
+
+
+def test_rows_with_bounds_of_their_own_are_drawn_with_the_widest() -> None:
+    low, high = rows(tensor([[-2.0], [-3.0]])), rows(tensor([[2.0], [1.0]]))
+    cost = adp.QuadraticCost(1.0, 0.1, dim=2, inputs=1).bounded(low, high)
+    plant = systems.Pendulum()
+    loop = adp.simulate(adp.LQR(plant, cost), plant, cost, tensor([[0.3, 0.0], [0.2, 0.0]]), dt=0.1, steps=3)
+    for one in (loop, pickle.loads(pickle.dumps(loop))):
+        assert "bounds -3 to 2, or less in some rows" in str(one)
+        drawn = lines(visible(one.figure())[2])
+        assert {float(y[0]) for _, x, y in drawn if list(x) == [0, 1]} == {-3.0, 2.0}

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import logging
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from ...lanes.row_numbers import some_rows
+from ...lanes.row_numbers import all_rows, some_rows
 from ...numerics.angles import wrap
 from ...numerics.checks import fail
 from ...results.pictures import LoopPicture
@@ -28,6 +29,14 @@ _NAMED = 6  # entries of a vector in a line
 _ZERO = 1e-9  # of the largest state: a set-point that is not drawn
 
 
+class Limits(NamedTuple):
+    """The widest bounds of the inputs of all rows."""
+
+    low: Tensor | None  # (m,); None for none at all
+    high: Tensor | None
+    alike: bool  # whether all rows have these
+
+
 @dataclasses.dataclass(frozen=True)
 class LoopAbout:
     """The loop in words, units and bounds; what its picture computes with stays out of a pickle."""
@@ -37,10 +46,9 @@ class LoopAbout:
     units: Units
     periodic: tuple[int, ...]
     clock: bool  # whether the last state is the time
-    low: Tensor | None  # (m,) of the inputs; None for none at all
-    high: Tensor | None
+    limits: Callable[[], Limits]  # of the inputs; looked for where somebody wants to see them
     cost: Cost | None = None  # around the plant
-    beside: Callable[[Tensor, Tensor], LoopResult] | None = None  # the LQR's from (R, n), of rows (R,)
+    beside: Callable[[Tensor, Tensor], LoopResult | None] | None = None  # the LQR's from (R, n), of rows (R,)
 
     @classmethod
     def of(
@@ -60,33 +68,55 @@ class LoopAbout:
             period: for which a control is held, s; None where it follows the state.
             run: the loop of another controller, from other states.
         """
-        bounds, clock = _bounds(controller) or cost.bounds, isinstance(system, Clocked)
-        low, high = (None, None) if bounds is None else (bounds.low, bounds.high)
+        clock = isinstance(system, Clocked)
         itself = isinstance(controller, Feedback) and isinstance(controller.policy, LQR)
         plant = type(system.plant if isinstance(system, Clocked) else system).__name__
 
-        def of_rows(x0: Tensor, rows: Tensor) -> LoopResult:
-            within = cost if low is None else cost.bounded(low, high)
+        def found() -> list[Bounds]:
+            return _bounds(controller) or ([] if cost.bounds is None else [cost.bounds])
+
+        def of_rows(x0: Tensor, rows: Tensor) -> LoopResult | None:
+            bounds = found()
+            if len(bounds) > 1:
+                return None  # rows of several kinds
+            within = cost.bounded(bounds[0].low, bounds[0].high) if bounds else cost
             lqr = Feedback(LQR(system, within, period))  # of all rows, where they have plants of their own
             with some_rows(rows):
                 return run(lqr, x0)
 
-        beside = None if itself else of_rows
-        facts = plant, controller.label, system.units, system.periodic, clock, low, high
-        return cls(*facts, cost, beside)
+        facts = plant, controller.label, system.units, system.periodic, clock
+        return cls(*facts, lambda: _widest(found()), cost, None if itself else of_rows)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "cost": None, "beside": None}
+        limits = functools.partial(Limits, *self.limits())
+        return {**self.__dict__, "limits": limits, "cost": None, "beside": None}
 
 
-def _bounds(holder: object, depth: int = 3) -> Bounds | None:
-    """Return the bounds of the inputs that a controller, or what is inside, was made with; None for none."""
+def _bounds(holder: object, depth: int = 3) -> list[Bounds]:
+    """Return the bounds of the inputs that a controller, or what is inside, was made with: of every kind of
+    rows, where there are several; empty for none."""
     bounds = getattr(holder, "bounds", None)
+    kinds = [_bounds(kind, depth) for kind in getattr(holder, "kinds", ())]
+    if kinds:
+        return [each for found in kinds for each in found]
     if isinstance(bounds, Bounds) and bounds.present:
-        return bounds
+        return [bounds]
     parts = (getattr(holder, name, None) for name in ("policy", "controller", "problem", "cost") if depth)
-    found = (_bounds(part, depth - 1) for part in parts if part is not None)
-    return next((each for each in found if each is not None), None)
+    within = (_bounds(part, depth - 1) for part in parts if part is not None)
+    return next((each for each in within if each), [])
+
+
+def _widest(found: Sequence[Bounds]) -> Limits:
+    """Return the widest bounds of all rows."""
+    if not found:
+        return Limits(None, None, True)
+    limits = [(each.low, each.high) for each in found]
+    low, high = (
+        torch.cat([all_rows(limit).reshape(-1, limit.shape[-1]) for limit in sides])
+        for sides in zip(*limits, strict=True)
+    )
+    alike = bool((low == low[:1]).all() and (high == high[:1]).all())
+    return Limits(low.amin(0), high.amax(0), alike)
 
 
 def summary(result: LoopResult) -> str:
@@ -99,8 +129,10 @@ def summary(result: LoopResult) -> str:
     states = Units().of_states(n) if about is None else about.units.of_states(n)
     inputs = Units().of_inputs(m) if about is None else about.units.of_inputs(m)
     bounded = ""
-    if about is not None and about.low is not None and about.high is not None:
-        bounded = f"; bounds {_numbers(about.low)} to {_numbers(about.high)}"
+    limits = None if about is None else about.limits()
+    if limits is not None and limits.low is not None and limits.high is not None:
+        own = "" if limits.alike else ", or less in some rows"
+        bounded = f"; bounds {_numbers(limits.low)} to {_numbers(limits.high)}{own}"
     far = _far(result)
     end = "" if far is None or not len(far) else f"|x - wanted| up to {float(far.max()):.3g}, "
     kept = f"; recorded: {', '.join(result.recorded)}" if result.recorded else ""
@@ -162,7 +194,7 @@ def picture(result: LoopResult, rows: Sequence[int] | None, lqr: bool) -> LoopPi
     dim, inputs = result.state.shape[-1], result.control.shape[-1]
     units, words, clock, low, high = Units(), "", False, None, None
     if about is not None:
-        units, clock, low, high = about.units, about.clock, about.low, about.high
+        units, clock, (low, high, _) = about.units, about.clock, about.limits()
         words = f"{about.plant}, {about.controller}"
     if len(chosen) < count:
         words += f", {len(chosen)} of {count} rows"
@@ -202,7 +234,8 @@ def _beside(result: LoopResult, row: int) -> tuple[Any, Any, Any] | None:
     try:
         at = torch.tensor([row], dtype=torch.int64, device="cpu")
         with torch.no_grad():
-            return _arrays(about.beside(result.state[[row], 0], at), [0])
+            found = about.beside(result.state[[row], 0], at)
+        return None if found is None else _arrays(found, [0])
     except (ValueError, RuntimeError) as error:
         _log.warning("no LQR beside this loop: %s", str(error).partition("\n")[0])
         return None

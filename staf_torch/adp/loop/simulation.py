@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ...lanes import Program
-from ...lanes.device.chunks import joined, rows_of, with_rows
+from ...lanes.device.chunks import beside_history, joined, rows_of, with_rows
 from ...lanes.gradients import wants_gradient
 from ...lanes.loop_program import LoopProgram
 from ...lanes.opaque import opaque
@@ -185,7 +185,7 @@ class _LoopRun:
             result, last = self.of(loop, ready.program)
         with torch.no_grad():
             seen = result.state[:, :: max(1, result.state.shape[1] // _SEEN)]
-            reach = wrap(seen, loop.system.periodic).abs().amax(-1).amax(-1).to(last.bent.device)
+            reach = beside_history(wrap(seen, loop.system.periodic).abs().amax(-1).amax(-1), last.bent)
             strained = ~(last.bent <= BENT * reach) & torch.isfinite(reach)
             if loop.euler:
                 strained[:_EULER] = True
@@ -293,11 +293,15 @@ def _run(
     none = torch.full_like(pieces[-1][1][:, -1], torch.nan, device=x0.device)
     last, structure = flatten(record(loop, state, none))
     pieces.append([part.unsqueeze(1) for part in last])
-    columns = [joined(column) for column in zip(*pieces, strict=True)]
-    where = next((column.device for column in columns if column.device != x0.device), x0.device)
-    kept = unflatten(structure, (column.to(where) for column in columns))
+    here = x0.is_cpu
+    columns = [torch.cat(each, dim=1) if here else joined(each) for each in zip(*pieces, strict=True)]
+    where = x0.device
+    if not here and any(column.is_cpu for column in columns):  # a device without room for them all
+        columns, where = [column.cpu() for column in columns], torch.device("cpu")
+    kept = unflatten(structure, iter(columns))
     time = torch.arange(0, steps + 1, every, dtype=torch.float64, device="cpu") * loop.dt
-    frozen_at = torch.where(state.alive, torch.inf, state.lived * loop.dt).to(where)
+    frozen_at = torch.where(state.alive, torch.inf, state.lived * loop.dt)
+    frozen_at = frozen_at if here else frozen_at.to(where)
     result = LoopResult(time, kept.x, kept.u, kept.cost, kept.recorded, frozen_at, state.carried)
     return result, state
 

@@ -206,7 +206,7 @@ def numpy_plant() -> systems.StepPlant:
         ),
         (
             lambda: adp.SampledProblem.of(systems.Pendulum(), adp.QuadraticCost(1.0, 1.0, 2, 1)),
-            "dt=....` must be a number",
+            "dt=....` must be given, s",
         ),
     ],
 )
