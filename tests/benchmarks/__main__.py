@@ -179,7 +179,7 @@ PARTS = {
     "planners": Part(
         "staf experiment=rivals rivals.plants=[pendulum] "
         "'rivals.methods=[near_optimal,box-DDP,plan followed,PathIntegral,GlobalValue]'",
-        {f"a control of {name}, pendulum, us": US.format(name) for name in PLANNERS},
+        {f"a control of {name}, pendulum from drawn states, us": US.format(name) for name in PLANNERS},
         2,
     ),
     "discs": Part(
