@@ -106,7 +106,7 @@ def test_the_command_prints_the_schema_of_a_group(
     monkeypatch.setattr(sys, "argv", ["staf", "schema", "adp/law"])
     with pytest.raises(SystemExit) as ended:
         main()
-    assert ended.value.code is None
+    assert not ended.value.code
     printed = json.loads(capsys.readouterr().out)
     assert printed["$ref"] == "#/$defs/adp.law"
     assert "adp.law" in printed["$defs"]
