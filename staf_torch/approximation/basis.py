@@ -132,7 +132,8 @@ class StaFBasis(nn.Module, metaclass=Rowwise):
         The first evaluation at y = x warns where sigma(x; x) is the same at every state: `check_own_value`.
         """
         trailing("StaFBasis", "y", y, dims=2, last=self.dim)
-        beside_batch("StaFBasis", "y", y, 2, x.shape[:-1], "x is")
+        if y.dim() > 2:
+            beside_batch("StaFBasis", "y", y, 2, x.shape[:-1], "x is")
         if self._unseen and _same(y, x):
             self.check_own_value(x.detach(), stacklevel=5)
         sigma: Tensor = self.kernel(y, self.centers(x))

@@ -289,7 +289,8 @@ class StaF(nn.Module):
                 f"`{call}(y=...)` of the shape {tuple(y.shape)} must say which points are meant: one of each "
                 f"batch entry ({one_each}), or all of them for every entry (`{whole}`, ({ones}, P, n))."
             )
-        beside_batch(call, "y", y, 2, batch, "the coefficients are")
+        if y.dim() > 2:
+            beside_batch(call, "y", y, 2, batch, "the coefficients are")
 
     def _along(self, y: Tensor, z: Tensor, mode: str, target: Target | None) -> Callable[[Tensor], Tensor]:
         """V^ as a function of a step of both y and x, with what else moves in this mode."""
