@@ -22,6 +22,15 @@ def gravity(x: Tensor, u: Tensor) -> Tensor:
 
 
 PENDULUM = adp.ParametricPlant(friction_and_inertia, gravity, dim=2, inputs=1, theta=TRUE)
+DAMPING = adp.ParametricPlant(
+    lambda x, u: torch.stack((torch.zeros_like(u), -x[..., 1:]), dim=-2),
+    lambda x, u: torch.stack((x[..., 1], u[..., 0] - x[..., 0].sin()), dim=-1),
+    dim=2,
+    inputs=1,
+    theta=[0.3],
+    rows=[1],
+)
+"""A pendulum of which the friction alone is unknown."""
 COST = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
 
 

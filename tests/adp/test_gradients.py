@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 from helpers import tensor, uniform
+from helpers_adaptation import DAMPING
 from torch import Tensor, nn
 
 import staf_torch as st
@@ -168,20 +169,12 @@ def identified(theta: Tensor, critic: Tensor, x: Tensor) -> Tensor:
 
 
 def adapted(critic: Tensor, actor: Tensor, x: Tensor) -> Tensor:
-    plant = adp.ParametricPlant(
-        lambda x, u: torch.stack((torch.zeros_like(u), -x[..., 1:]), dim=-2),
-        lambda x, u: torch.stack((x[..., 1], u[..., 0] - x[..., 0].sin()), dim=-1),
-        dim=2,
-        inputs=1,
-        theta=[0.3],
-        rows=[1],
-    )
     first = {"critic": critic, "actor": actor}
     points = adp.QuadraturePoints(3, 2, half_width=0.2)
-    inside = adp.ActorCritic(adp.QuadraticBasis(2), plant, COST, points, adp.PolicyIteration(), **first)
+    inside = adp.ActorCritic(adp.QuadraticBasis(2), DAMPING, COST, points, adp.PolicyIteration(), **first)
     law = adp.LeastSquares([0.0], deviation=1.0, floor=1e-5)
-    control = adp.AdaptiveActorCritic(inside, plant, adp.IntegralWindows(plant, 0.02), law)
-    return adp.simulate(control, plant, COST, x, dt=0.02, steps=6, compile=False).cost
+    control = adp.AdaptiveActorCritic(inside, DAMPING, adp.IntegralWindows(DAMPING, 0.02), law)
+    return adp.simulate(control, DAMPING, COST, x, dt=0.02, steps=6, compile=False).cost
 
 
 def tracked(q: Tensor, r: Tensor, size: Tensor, x: Tensor) -> Tensor:

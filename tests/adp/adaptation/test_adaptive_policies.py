@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 from helpers import changed, tensor, uniform
-from helpers_adaptation import COST, friction_and_inertia, gravity
+from helpers_adaptation import COST, DAMPING, friction_and_inertia, gravity
 from torch import Tensor
 
 from staf_torch import GaussianKernel, adp, rings, systems
@@ -263,18 +263,10 @@ def test_the_robust_policy_has_the_control_in_doubt() -> None:
 
 
 def test_weights_begin_anew_where_the_plant_becomes_another_one() -> None:
-    damping = adp.ParametricPlant(
-        lambda x, u: torch.stack((torch.zeros_like(u), -x[..., 1:]), dim=-2),
-        lambda x, u: torch.stack((x[..., 1], u[..., 0] - x[..., 0].sin()), dim=-1),
-        dim=2,
-        inputs=1,
-        theta=[0.3],
-        rows=[1],
-    )
-    plant = adp.ChangingPlant(damping)
+    plant = adp.ChangingPlant(DAMPING)
     z0 = plant.start(tensor([[2.0, 0.0]]), before=[0.3], after=[3.0], at=0.5)
     law = adp.LeastSquares([0.0], deviation=3.0, floor=1e-4, alarm=8.0)
-    inside = adp.AdaptiveActorCritic(LEARNER, damping, adp.IntegralWindows(damping, 0.01), law)
+    inside = adp.AdaptiveActorCritic(LEARNER, DAMPING, adp.IntegralWindows(DAMPING, 0.01), law)
     control = adp.Measured(inside, noise=0.0, dim=2)
     run = adp.simulate(control, plant, plant.cost(COST), z0, dt=0.01, steps=80, compile=False)
     anew = int((run["resets"][0] > 0).to(torch.int8).argmax())
