@@ -7,16 +7,33 @@ of a state or of a handful of centers, and order is found by comparing every pai
 from __future__ import annotations
 
 import functools
+import inspect
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch._decomp import decomposition_table
 
 from .tracer import NotLoweredError
 
+_OF_TORCH = "torch._decomp.decompositions"
 _WINITZKI = 0.147  # of a formula for erfinv with a relative error of 2e-3
+
+
+def of_torch(func: Any, args: Sequence[Any]) -> Callable[..., Any] | None:
+    """Return torch's own decomposition of an operation, None where there is none.
+
+    That of tensors of one floating dtype comes without the promotion of dtypes around it, which changes
+    nothing then: it imports sympy, half a second in every process.
+    """
+    found: Callable[..., Any] | None = decomposition_table.get(func)
+    dtypes = {each.dtype for each in args if isinstance(each, Tensor)}
+    if found is None or len(dtypes) != 1 or not dtypes < {torch.float32, torch.float64}:
+        return found
+    bare: Callable[..., Any] = inspect.unwrap(found)
+    return bare if bare.__module__ == _OF_TORCH else found
 
 
 def sort(

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch._decomp import decomposition_table
 from torch.overrides import TorchFunctionMode
 
 from ..emit.schedule import Sizes
@@ -26,7 +25,7 @@ from ..tree import Shared, Tree, flatten, plain
 from . import eigenvalues, factorisations
 from . import reductions as reductions  # its rules
 from .captured_tensors import Recipe, tensors
-from .decompositions import REPLACEMENTS
+from .decompositions import REPLACEMENTS, of_torch
 from .entrywise import RULES
 from .graph import NOW, STEP, Graph
 from .indexing import CHOICES, MOVEMENTS, added_at, many, moved
@@ -56,7 +55,7 @@ def lower(t: Tracer, func: Any, name: str, out: Any, args: Sequence[Any], kwargs
     if name in MOVEMENTS and not rolled:
         return moved(t, func, out, args, kwargs)
     tables: Any = (CHOICES,) if rolled else (FACTORISATIONS, REPLACEMENTS)
-    decomposition = next((table[name] for table in tables if name in table), decomposition_table.get(func))
+    decomposition = next((table[name] for table in tables if name in table), of_torch(func, args))
     if name == "linalg_lu_solve" and any(
         t.graph.value(node) != -1 for node in t.nodes(args[1]).ravel().tolist()
     ):
