@@ -61,7 +61,7 @@ def seed_parts(seeds: Sequence[int], like: Tensor) -> Tensor:
     """Return the four 16-bit parts of seeds, (B, 4), which every float holds."""
     if isinstance(seeds, range) and seeds and max(seeds[0], seeds[-1]) < 2**63:  # of a million rows, say
         whole = torch.arange(seeds.start, seeds.stop, seeds.step, device=like.device)
-        rows = torch.stack([(whole >> (16 * k)) & _HALF for k in range(4)], dim=-1)
+        rows = (whole.unsqueeze(-1) >> torch.arange(0, 64, 16, device=like.device)) & _HALF
     else:
         parts = [[(seed >> (16 * k)) & _HALF for k in range(4)] for seed in seeds]
         rows = torch.tensor(parts, dtype=torch.int64, device="cpu")

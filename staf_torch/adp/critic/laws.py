@@ -218,7 +218,7 @@ class Information(ActorCriticLaw):
     """
 
     def init(self, critic: Tensor, actor: Tensor, gain: Tensor) -> Weights:
-        return Weights(critic, actor, torch.linalg.inv(gain))
+        return Weights(critic, actor, torch.linalg.inv_ex(gain)[0].contiguous())  # waits for no device
 
     def rates(self, sums: BellmanSums, weights: Weights) -> Weights:
         return Weights(

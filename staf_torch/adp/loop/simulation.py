@@ -186,7 +186,7 @@ class _LoopRun:
         with torch.no_grad():
             seen = result.state[:, :: max(1, result.state.shape[1] // _SEEN)]
             reach = beside_history(wrap(seen, loop.system.periodic).abs().amax(-1).amax(-1), last.bent)
-            strained = ~(last.bent <= BENT * reach) & torch.isfinite(reach)
+            strained = ~(last.bent <= BENT * reach) & (reach < torch.inf)
             if loop.euler:
                 strained[:_EULER] = True
         if bool(strained.any()):
@@ -279,7 +279,9 @@ def _run(
     row = {"seed": seed_parts(seeds, x0)} if draws and not old else {}
     generators = [torch.Generator().manual_seed(seed) for seed in (seeds if old else ())]
     draws = draws if old else 0  # ahead of the loop; others are drawn in it
-    ahead = max(1, min(_DRAWN_AHEAD, _NUMBERS // (x0.numel() * max(draws, 1))))
+    ahead = _DRAWN_AHEAD
+    if draws or x0.is_cpu:  # elsewhere a piece is a kernel, which nobody waits for
+        ahead = max(1, min(ahead, _NUMBERS // (x0.numel() * max(draws, 1))))
     while done < steps:
         # A piece ends at a recorded time, or there is none inside.
         count = ahead // every * every if every <= ahead else min(ahead, every - done % every)
