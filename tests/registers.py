@@ -12,11 +12,11 @@ ARCHITECTURES = (80, 90, 100)
 
 
 def ptxas(text: str, architectures: tuple[int, ...] = ARCHITECTURES) -> dict[int, tuple[int, int, int]]:
-    """Registers, bytes spilled and bytes of stack of a kernel, by nvcc and ptxas; the better of two ways."""
+    """Registers, bytes spilled and bytes of stack of a kernel, by nvcc and ptxas; less stack is better."""
     found = _ptxas(text, architectures, ())
     spilling = tuple(each for each, (_, spilled, _) in found.items() if spilled)
     other = _ptxas(text, spilling, (FEWER_REGISTERS,)) if spilling else {}
-    return found | {each: of for each, of in other.items() if of[1] < found[each][1]}
+    return found | {each: of for each, of in other.items() if of[2] < found[each][2]}
 
 
 def _ptxas(

@@ -88,7 +88,7 @@ def sums_of_sines(numbers: Tensor) -> lanes.Program:
 
 def test_a_graph_outlives_the_program_that_was_recorded() -> None:
     """A table too long for a kernel's arguments is read where it was."""
-    program = sums_of_sines(torch.linspace(0, 1, 400, dtype=torch.float64))
+    program = sums_of_sines(torch.linspace(0, 1, 1600, dtype=torch.float64))
     x = X0[:, 0].clone()
     with lanes.device.host():
         program(x, steps=3)
@@ -97,7 +97,7 @@ def test_a_graph_outlives_the_program_that_was_recorded() -> None:
     wanted = program.definition(2 * x, steps=3)[1]
     del program
     gc.collect()
-    others = [torch.full((400,), torch.nan, dtype=torch.float64) for _ in range(50)]
+    others = [torch.full((1600,), torch.nan, dtype=torch.float64) for _ in range(50)]
     x.mul_(2)
     graph.replay()
     torch.testing.assert_close(found, wanted, rtol=1e-12, atol=1e-12)

@@ -29,8 +29,9 @@ from ..locks import Mutex
 _log = logging.getLogger(__name__)
 REMEDY = "install torch with CUDA, or `pip install staf-torch[cuda]`"
 _OPTIONS = ("--std=c++17", "--fmad=false", "--ptxas-options=-v")
-_SPILLED = re.compile(r"(\d+) bytes spill stores")
+_STACK = re.compile(r"(\d+) bytes stack frame, (\d+) bytes spill stores")
 _DIGEST = 32
+_LONG_ARGUMENTS = 12010  # the first version of CUDA of which a kernel's arguments may take 32764 bytes
 _WARP, _BLOCK = 32, 128
 _FEW = 8  # warps a multiprocessor up to which every warp is a block, so that all multiprocessors have some
 _NO_CONTEXT = (3, 201)  # not initialised, invalid context
@@ -83,6 +84,13 @@ class CudaDevice:
         _checked(driver.cuDeviceGet(ctypes.byref(number), self.index))
         _checked(driver.cuDevicePrimaryCtxRetain(ctypes.byref(context), number))
         _checked(driver.cuCtxSetCurrent(context))
+
+    def arguments(self) -> int:
+        """Return the bytes that the arguments of a kernel may take: more since CUDA 12.1."""
+        version, compiler = ctypes.c_int(), _nvrtc()
+        _checked(_driver().cuDriverGetVersion(ctypes.byref(version)))
+        known = compiler is not None and compiler.number >= _LONG_ARGUMENTS
+        return 32764 if known and version.value >= _LONG_ARGUMENTS else 4096
 
     def memory(self) -> int:
         """Return the bytes of all its memory."""
@@ -201,6 +209,7 @@ class Nvrtc:
         major, minor = ctypes.c_int(), ctypes.c_int()
         call.nvrtcVersion(ctypes.byref(major), ctypes.byref(minor))
         self.version = f"{major.value}.{minor.value}"
+        self.number = 1000 * major.value + 10 * minor.value
 
     def architectures(self) -> list[int]:
         """Return the architectures for which it makes machine code."""
@@ -213,19 +222,20 @@ class Nvrtc:
     def compile(self, text: str, architecture: int) -> bytes:
         """Return machine code, or PTX of the latest that it knows where a card is newer.
 
-        What does not fit into registers is compiled once more for fewer, and the better one is taken.
+        What does not fit into registers is compiled once more for fewer, and the one with less memory of a
+        thread's own is taken: more bytes spilled, and read rarely, cost less than whole matrices there.
 
         Raises:
             OSError: with what it says.
         """
-        code, spilled = self._compiled(text, architecture, ())
+        code, stack, spilled = self._compiled(text, architecture, ())
         if spilled:
-            other, less = self._compiled(text, architecture, (FEWER_REGISTERS,))
-            code = other if less < spilled else code
+            other, less, _ = self._compiled(text, architecture, (FEWER_REGISTERS,))
+            code = other if less < stack else code
         return code
 
-    def _compiled(self, text: str, architecture: int, more: tuple[str, ...]) -> tuple[bytes, int]:
-        """Machine code, and the bytes of registers that it stores elsewhere."""
+    def _compiled(self, text: str, architecture: int, more: tuple[str, ...]) -> tuple[bytes, int, int]:
+        """Machine code, the bytes of a thread's memory, and of the registers that it stores there."""
         known = self.architectures()
         latest = max((each for each in known if each <= architecture), default=architecture)
         kind = "sm" if architecture in known else "compute"
@@ -240,7 +250,8 @@ class Nvrtc:
             told = self._read("ProgramLog", program).decode(errors="replace")
         finally:
             library.nvrtcDestroyProgram(ctypes.byref(program))
-        return code, sum(map(int, _SPILLED.findall(told)))
+        stack, spilled = zip(*_STACK.findall(told) or [(0, 0)], strict=True)
+        return code, sum(map(int, stack)), sum(map(int, spilled))
 
     def _read(self, what: str, program: ctypes.c_void_p) -> bytes:
         size = ctypes.c_size_t()

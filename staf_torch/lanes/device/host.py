@@ -166,6 +166,10 @@ class HostDevice:
             _launches.append(lambda: kernel(ctypes.addressof(copy), *sizes))
         kernel(ctypes.addressof(arguments), *sizes)
 
+    def arguments(self) -> int:
+        """Return the bytes that the arguments of a kernel may take: any."""
+        return sys.maxsize
+
     def memory(self) -> int:
         """Return the bytes that results of a call may take."""
         return _memory

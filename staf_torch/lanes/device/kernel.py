@@ -21,6 +21,7 @@ from .cuda import CudaDevice
 from .host import HostDevice, capturing
 
 _MOST = 2**31 - 1  # of an offset of 32 bits
+_OTHERS = 2048  # bytes of a kernel's arguments that are kept for others than its table
 
 
 class Device(Protocol):
@@ -31,6 +32,9 @@ class Device(Protocol):
 
     def launch(self, kernel: Any, arguments: ctypes.Array[ctypes.c_char], rows: int) -> None:
         """Start a kernel for so many rows, with this structure."""
+
+    def arguments(self) -> int:
+        """Return the bytes that the arguments of a kernel may take."""
 
     def memory(self) -> int:
         """Return the bytes of all its memory."""
@@ -49,15 +53,17 @@ def device(where: torch.device) -> Device:
     return HostDevice() if where.type == "cpu" else CudaDevice(where.index)
 
 
-def kernel_text(source: str, *, unit: bool, wide: bool) -> str:
+def kernel_text(source: str, *, unit: bool, wide: bool, far: bool) -> str:
     """Return the text of a kernel for a kind of inputs.
 
     Args:
         source: of `emit_cuda`.
         unit: whether the entries of every input lie side by side.
         wide: whether offsets take 64 bits.
+        far: whether its table lies in memory although it is short enough for the arguments.
     """
     head = ["#define UNIT"] if unit else []
+    head += ["#define FAR"] if far else []
     head += ["#define OFFSET long long"] if wide else []
     return "\n".join([*head, source])
 
@@ -117,7 +123,11 @@ class DeviceCall:
         unit = all(entry == 1 or entries == 1 for *_, entry, entries in read)
         self._device, self._all = device(where), [room for room in self._rooms if room is not None]
         self._bytes = sum(room.bytes for room in self._rooms if room is not None)
-        self.text = kernel_text(compiled.call, unit=unit, wide=wide)
+        table, room = compiled.table, self._device.arguments() - _OTHERS
+        near = in_arguments(table.numel(), table.dtype == torch.float32)
+        self._near = near and table.nbytes <= room
+        far = near and not self._near
+        self.text = kernel_text(compiled.call, unit=unit, wide=wide, far=far)
         self._kernel = self._device.compile(self.text)
         self._arguments(read, rows, steps, every)
 
@@ -127,7 +137,7 @@ class DeviceCall:
         pointers, numbers = len(read) + len(self._rooms), table.tolist()
         kind = "f" if self._compiled.real == torch.float32 else "d"
         held = f"{len(numbers)}{kind}"
-        if not in_arguments(len(numbers), kind == "f"):
+        if not self._near:
             self._table = table.to(self._where)
             numbers, held = [self._table.data_ptr()], "P"
         strides = [stride for slot in read for stride in slot[:3]]

@@ -22,7 +22,7 @@ from .tables import TableWriter, Text
 
 KERNEL = "lanes_kernel"
 _KINDS = ("row", "now", "carry", "out")
-_IN_ARGUMENTS = 2048  # bytes of a table that come with the arguments of a kernel, of which 4096 may be
+_IN_ARGUMENTS = 12 * 1024  # bytes of a table that come with the arguments of a kernel
 _CONSTANT = 48 * 1024  # bytes of arrays that constant memory holds
 _SIZES = {"short": 2, "int": 4, "float": 4, "double": 8}
 _OF_C = {
@@ -78,10 +78,10 @@ def emit_cuda(
     """Write the kernel of a program: ``following`` are the carry after a step, ``outputs`` what it puts out.
 
     Its one argument is a structure: the addresses of row0, ..., now0, ..., carry0, ..., of the carry in the
-    end and of out0, ...; the table; for each input the strides from row to row, from time to time and from
-    entry to entry; the numbers of rows, times and times from one recorded to the next. Offsets in what is
-    written, and from entry to entry, are of the type `OFFSET`, 32 bits by default. With `UNIT` the entries of
-    every input lie side by side.
+    end and of out0, ...; the table, or its address where it is long or with `FAR`; for each input the strides
+    from row to row, from time to time and from entry to entry; the numbers of rows, times and times from one
+    recorded to the next. Offsets in what is written, and from entry to entry, are of the type `OFFSET`,
+    32 bits by default. With `UNIT` the entries of every input lie side by side.
 
     Raises:
         NotLoweredError: if an operation, or a dtype, has no scalar form.
@@ -116,17 +116,17 @@ class _CudaWriter(ScalarWriter, TableWriter):
         lines = [f"    const {_type_of(dtype)} *{name};" for name, dtype in read]
         lines += [f"    {_type_of(dtype)} *{name};" for name, dtype in written]
         size = max(len(self.table), 1)
-        here = in_arguments(size, self.graph.single)
-        lines += [f"    {real} c[{size}];" if here else f"    const {real} *c;"]
+        far = f"    const {real} *c;", "#define TABLE(at) __ldg(call.c + (at))"
+        near = f"    {real} c[{size}];", "#define TABLE(at) call.c[at]"
+        choice = ("#ifdef FAR", *far, "#else", *near, "#endif")
+        lines += choice if in_arguments(size, self.graph.single) else far
         lines += [f"    long long {name}_row, {name}_time, {name}_entry;" for name, _ in read]
-        macro = "call.c[at]" if here else "__ldg(call.c + (at))"
         return [
             "struct Call {",
             *lines,
             "    long long rows;",
             "    int times, every;",
             "};",
-            f"#define TABLE(at) {macro}",
         ]
 
     def _line(self, text: str) -> None:
