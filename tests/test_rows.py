@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import pickle
 import random
 import sys
@@ -349,15 +350,30 @@ def test_a_controller_goes_to_a_device_row_by_row(tmp_path: Path) -> None:
             export()
 
 
-def test_a_rule_names_the_first_row_that_breaks_it() -> None:
-    for make in (
-        lambda: systems.Pendulum(mass=st.rows(torch.tensor([1.0, -1.0]))),
-        lambda: st.GaussianKernel(st.rows(torch.tensor([1.0, -1.0]))),
-        lambda: optim.FixedStep(st.rows(torch.tensor([1.0, 3.0]))),
-        lambda: adp.QuadraticCost(st.rows(torch.tensor([1.0, -1.0])), 1.0, 2, 1),
-    ):
-        with pytest.raises(ValueError, match="row 1"):
-            make()
+@pytest.mark.parametrize(("name", "wrong"), by_turns(CASES, (-1.0, math.inf, 0.0)))
+def test_a_rule_that_a_number_breaks_alone_is_broken_in_its_row_by_name(name: str, wrong: float) -> None:
+    case = CASES[name]
+    numbers = {key: spread(*ends) for key, ends in case.numbers.items()}
+
+    def made(key: str, value: Any) -> str:
+        """What is said of this number, beside others that are right."""
+        beside = {each: given[0].tolist() for each, given in numbers.items() if each != key}
+        try:
+            case.run(**beside, **{key: value})
+        except ValueError as error:
+            return str(error)
+        return ""
+
+    for key, given in numbers.items():
+        for bad in (math.nan, wrong):
+            given[-1].view(-1)[-1] = bad
+            alone, many = made(key, given[-1].tolist()), made(key, st.rows(given))
+            if alone or many:  # alone it may break no rule, and differ from the others in more than numbers
+                assert many.startswith(alone.split(";")[0] or "rows differ in `")
+                assert f"row {FEW - 1}" in many
+
+
+def test_what_is_no_number_of_rows_is_refused() -> None:
     with pytest.raises(ValueError, match="must have a first dimension of rows"):
         st.rows(torch.tensor(1.0))
     with pytest.raises(ValueError, match=r"must be floating-point numbers; got torch\.int64"):

@@ -153,6 +153,7 @@ VARIANTS = {
 """What needs no argument: files of the rooms, and controllers that `tests/variants.py` lists."""
 CALLS: dict[str, Callable[..., Any]] = {
     **{each.__name__: each for each in PLAIN},
+    "Measured": of(adp.Measured, adp.Feedback(LQR), dim=2),
     "ActorCritic": of(adp.ActorCritic, adp.QuadraticBasis(2), PLANT, COST, adp.RandomPoints(1, 1.0)),
     "StaFValueBasis": of(adp.StaFValueBasis, st.StaFBasis(st.ExponentialKernel(), BASIS.centers)),
     "RBFGridBasis": of(adp.RBFGridBasis, dim=2, points=2),
@@ -261,6 +262,12 @@ def mixed(**given: Any) -> Any:
 
 
 REFUSED: list[tuple[Callable[[], Any], str]] = [
+    (lambda: systems.find_equilibrium(PLANT, [0.0, math.nan]), "(x=...)` must be finite"),
+    (lambda: systems.Bounds(st.rows(THREE), None, 3), "`Bounds(low=...)` must be the same numbers for all"),
+    (
+        lambda: adp.ActorCritic(adp.QuadraticBasis(2), PLANT, COST, POINTS, critic=THREE[0] * math.nan),
+        "(critic=...)` must be finite",
+    ),
     (lambda: BASIS(THREE, TWO[0]), "must have 2 entries in its last dimension"),
     (lambda: BASIS.local(THREE), "`StaFBasis.local(x=...)` must have 2 entries"),
     (lambda: STAF.hessian(TWO, mode="no"), "`StaF.hessian(mode=...)` must be one of"),
@@ -419,6 +426,9 @@ def test_the_edge_of_a_rule_is_accepted_and_what_breaks_it_refused_by_name(rule:
         named = re.escape(f"`{rule.call}({rule.argument}=...)` must ")
         with pytest.raises(ValueError, match=named):
             CALLS[rule.call](**{rule.argument: value})
+    if rule.kind not in ("integer", "flag", "choice"):
+        with pytest.raises(ValueError, match=rf"`\w+(\.of)?\({rule.argument}=.* (row 1|for all rows)"):
+            CALLS[rule.call](**{rule.argument: st.rows(torch.tensor([0.05, math.nan]).double())})
     edge = list(EDGE.get(rule.kind, ())) + list(rule.allowed)
     if rule.kind == "integer" and rule.least is not None and rule[:2] not in NOT_ALONE:
         edge.append(rule.least)

@@ -399,9 +399,10 @@ class Merge:
     def _differ(self, values: list[Any], name: str) -> ValueError:
         other = next(k for k, value in enumerate(values) if not _equal(value, values[0]))
         row, first = (int(self._rows[k][0]) if k < len(self._rows) else None for k in (other, 0))
+        left, right = (x.tolist() if isinstance(x, Tensor) else x for x in (values[0], values[other]))
         return ValueError(
-            f"rows differ in `{name}`, which is no number: {values[0]!r} in row {first} and "
-            f"{values[other]!r} in row {row}; what is no number must be the same in all rows."
+            f"rows differ in `{name}`, which is no number: {left!r} in row {first} and "
+            f"{right!r} in row {row}; what is no number must be the same in all rows."
         )
 
 
@@ -431,6 +432,8 @@ def row_of(value: Some, row: int) -> Some:
 
 def _equal(one: Any, other: Any) -> bool:
     try:
+        if isinstance(one, Tensor):
+            return isinstance(other, Tensor) and torch.equal(one, other)
         return type(one) is type(other) and bool(one == other)
     except (RuntimeError, ValueError):
         return False

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from ..lanes.gradients import refuse_gradient
-from ..lanes.row_numbers import RowNumbers, all_rows
+from ..lanes.row_numbers import RowNumbers, all_rows, in_use
 from . import COMMAND_LINE as COMMAND_LINE
 from . import fail as fail
 from . import show
@@ -185,13 +185,21 @@ def numbers_of(call: str, name: str, value: Any) -> Any:
     """The numbers of a tensor, which carry no gradient on, as nested lists; anything else as it is."""
     if not isinstance(value, Tensor):
         return value
+    check_shared(call, name, value)
     refuse_gradient(call, **{name: value})
     return value.tolist()
+
+
+def check_shared(call: str, name: str, value: Tensor) -> None:
+    """Refuse numbers of rows where nobody has said whose are meant, outside of what serves them."""
+    if isinstance(value, RowNumbers) and in_use():
+        raise fail(call, name, "must be the same numbers for all rows", value)
 
 
 def one_or_each(call: str, name: str, value: Any, count: int) -> Tensor:
     """Return a finite number for each of ``count``, given as one for all or one each: (count,) float64."""
     if isinstance(value, Tensor):
+        check_shared(call, name, value)
         refuse_gradient(call, **{name: value})
         number(call, name, value)
         if value.dim() > 1 or (value.dim() and len(value) != count):

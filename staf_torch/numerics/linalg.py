@@ -16,7 +16,7 @@ from torch import Tensor
 from ..lanes.call import seen_by_others
 from ..lanes.one_thread import alone, small_in_scipy
 from ..lanes.row_decisions import in_any_row
-from .checks import fail, positive_real, real, vector
+from .checks import fail, non_negative, positive, vector
 from .default_device import designed_on_cpu
 from .riccati_equations import continuous_solution, discrete_gain, discrete_solution
 
@@ -47,10 +47,13 @@ def _symmetric(call: str, name: str, matrix: Tensor, size: int) -> None:
 
 def square(call: str, name: str, value: Matrix, size: int) -> Tensor:
     """A matrix given as itself, by its diagonal, or as a number times the identity: (size, size)."""
+    number = non_negative if name == "terminal" else positive  # nothing may be paid at the end
     if isinstance(value, Tensor):
         given = value.to(torch.float64)
         if given.dim() > 1:
             return given
+        if not given.dim():
+            number(call, name, given)
         identity = torch.eye(size, dtype=torch.float64, device=given.device)
         return given.diag() if given.dim() else given * identity
     if isinstance(value, Sequence) and not isinstance(value, str):
@@ -59,7 +62,6 @@ def square(call: str, name: str, value: Matrix, size: int) -> Tensor:
             return given.diag()
         rows = [vector(call, name, row, len(value)) for row in value]
         return torch.tensor(rows, dtype=torch.float64, device="cpu")
-    number = real if name == "terminal" else positive_real  # nothing may be paid at the end
     return number(call, name, value) * torch.eye(size, dtype=torch.float64, device="cpu")
 
 

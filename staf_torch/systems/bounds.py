@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from ..lanes.gradients import refuse_gradient
+from ..lanes.row_decisions import in_any_row
 from ..lanes.row_numbers import all_rows
-from ..numerics.checks import fail
+from ..numerics.checks import check_shared, fail
 
 Limit = float | Sequence[float] | Tensor | None
 
@@ -52,8 +53,8 @@ class Bounds:
 
     @property
     def present(self) -> bool:
-        """Return whether any input is bounded."""
-        return any(bool(torch.isfinite(all_rows(limit)).any()) for limit in (self.low, self.high))
+        """Return whether any input is bounded, of numbers of rows in any row."""
+        return any(in_any_row(torch.isfinite(limit)) for limit in (self.low, self.high))
 
     def clip(self, u: Tensor) -> Tensor:
         """The nearest admissible input: (..., m) -> (..., m)."""
@@ -78,6 +79,8 @@ def _limit(name: str, given: Limit, none: float, inputs: int) -> Tensor:
         given = none
     if isinstance(given, bool) or not isinstance(given, int | float | Sequence | Tensor):
         raise fail("Bounds", name, "must be a number or one an input", given)
+    if isinstance(given, Tensor):
+        check_shared("Bounds", name, given)
     refuse_gradient("Bounds", **{name: given})
     try:
         limit = torch.as_tensor(given, dtype=torch.float64, device="cpu").detach()

@@ -11,7 +11,7 @@ from torch import Tensor
 from ..lanes.gradients import refuse_gradient
 from ..lanes.row_decisions import in_any_row
 from ..lanes.row_objects import by_rows
-from ..numerics.checks import object_of
+from ..numerics.checks import number, object_of
 from ..numerics.differences import central_slopes
 from ..signs import Sign
 from .base import Plant
@@ -116,12 +116,8 @@ def find_equilibrium(
     """
     object_of("find_equilibrium", Plant, plant=plant)
     refuse_gradient("find_equilibrium", plant=plant, x=x, u=u)
-    x = torch.as_tensor(x, dtype=torch.float64, device=getattr(x, "device", "cpu"))
-    u = (
-        plant.resting_input()
-        if u is None
-        else torch.as_tensor(u, dtype=torch.float64, device=getattr(u, "device", "cpu"))
-    )
+    x = _guess("x", x)
+    u = plant.resting_input() if u is None else _guess("u", u)
     held = resting_input_at(plant, x, u)
     if bool(torch.isfinite(held).all()) and _rests(plant, x, held):
         return Equilibrium(x, held)
@@ -136,6 +132,12 @@ def find_equilibrium(
         f"{u.tolist()}: state {worst} keeps moving, by {float(moves[worst]):.6g}. Give a better "
         "`equilibrium=(state, input)`."
     )
+
+
+def _guess(name: str, value: Sequence[float] | Tensor) -> Tensor:
+    guess = torch.as_tensor(value, dtype=torch.float64, device=getattr(value, "device", "cpu"))
+    number("find_equilibrium", name, guess)
+    return guess
 
 
 def _gauss_newton(motions: Callable[[Tensor], Tensor], z: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ...numerics.angles import wrap
-from ...numerics.checks import choice, fail, trailing
+from ...numerics.checks import choice, fail, positive, trailing, vector
 from ..loop.controller import Controller
 from .history_stack import ConcurrentGradient, HistoryStack, Stack
 from .parametric import ParametricPlant
@@ -94,9 +94,9 @@ class ConcurrentTracker(Controller):
         self.gains = []
         for name, value in (("feedback", feedback), ("gain", gain), ("rate", rate), ("length", length)):
             given = torch.as_tensor(value, dtype=torch.float64, device=getattr(value, "device", "cpu"))
-            if given.dim() > 1 or not bool((given > 0).all()):
-                raise fail("ConcurrentTracker", name, "must be positive, a number or one a row", value)
-            self.gains.append(given)
+            if given.dim() > 1:
+                raise fail("ConcurrentTracker", name, "must be a number or one a row", value)
+            self.gains.append(positive("ConcurrentTracker", name, given))
         self.plant, self.reference = plant, reference
         longest = float(self.gains[3].max())
         made = IntegralWindows if source == "integral" else SlopeWindows
@@ -104,11 +104,8 @@ class ConcurrentTracker(Controller):
         p, n = plant.parameters_count, plant._size()
         self.angles = tuple(index % n for index in plant.periodic if index % n < plant.inputs)
         self.stack = HistoryStack(len(plant.rows), p, size)
-        self.first = (
-            torch.zeros(p, device="cpu").double()
-            if first is None
-            else torch.tensor(first, dtype=torch.float64, device="cpu")
-        )
+        started = vector("ConcurrentTracker", "first", [0.0] * p if first is None else first, p)
+        self.first = torch.tensor(started, dtype=torch.float64, device="cpu")
 
     def init(self, x0: Tensor) -> Tracking:
         trailing(type(self).__name__, "x0", x0, 2)

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from ...numerics.checks import fail, object_of, positive, trailing, vector
+from ...numerics.checks import fail, number, object_of, positive, trailing, vector
 from ...numerics.default_device import device_of
 from ...systems import ControlAffineSystem
 from ..loop.controller import Controller
@@ -147,7 +147,8 @@ class ActorCritic(Controller):
 
 def _weights(name: str, value: Initial, count: int) -> Tensor:
     if isinstance(value, Tensor):
-        return trailing("ActorCritic", name, value, dims=1, last=count)
+        number("ActorCritic", name, trailing("ActorCritic", name, value, dims=1, last=count))
+        return value
     if isinstance(value, int | float):
         value = [value] * count
     return torch.tensor(vector("ActorCritic", name, value, count), dtype=torch.float64, device="cpu")

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from ...centers import ConstantRadius, Radius
 from ...lanes.row_objects import OfRows
-from ...numerics.checks import choice, integer
+from ...numerics.checks import choice, integer, positive
 
 
 class Extrapolation(nn.Module, metaclass=OfRows):
@@ -50,7 +50,9 @@ class Extrapolation(nn.Module, metaclass=OfRows):
         choice(name, "around", around, ("state", "origin"))
         if centers not in ("moving", "fixed"):
             raise ValueError(f"`{name}(centers=...)` must be 'moving' or 'fixed'; got {centers!r}.")
-        self.half_width = half_width if isinstance(half_width, Radius) else ConstantRadius(half_width)
+        if not isinstance(half_width, Radius):
+            half_width = ConstantRadius(positive(name, "half_width", half_width))
+        self.half_width = half_width
         self.moving = centers == "moving"
         self.fixed_box = around == "origin"
         if self.fixed_box and not self.half_width.constant:

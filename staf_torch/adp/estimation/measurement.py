@@ -8,7 +8,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ...numerics.checks import fail, trailing
+from ...lanes.row_decisions import in_any_row
+from ...numerics.checks import non_negative, one_or_each, trailing
 from ..loop.controller import Carried, Controller
 from ..problem.cost import Output
 
@@ -36,7 +37,8 @@ class Measured(Controller):
 
     Args:
         controller: of y.
-        noise: standard deviation, one number or one an output, in the units of y, not negative.
+        noise: standard deviation, one number or one an output, in the units of y, not negative. Where it is
+            0 nothing is drawn, of rows where it is 0 in all.
         dim: q, entries of y.
         output: h, (..., n) -> (..., q); None for the first q states.
 
@@ -53,13 +55,10 @@ class Measured(Controller):
         output: Output | None = None,
     ) -> None:
         super().__init__()
-        several = [noise] * dim if isinstance(noise, int | float) else list(noise)
-        if len(several) != dim or not all(s >= 0 for s in several):
-            raise fail("Measured", "noise", f"must not be negative, one number or {dim}", noise)
         self.controller, self.dim, self.output = controller, dim, output
-        self.noise = torch.tensor(several, dtype=torch.float64, device="cpu")
+        self.noise = non_negative("Measured", "noise", one_or_each("Measured", "noise", noise, dim))
         # Normal numbers come in pairs: an odd number of outputs takes two points of the state's size.
-        self._own = (1 + dim % 2) if any(s > 0 for s in several) else 0
+        self._own = (1 + dim % 2) if in_any_row(self.noise > 0) else 0
         self.period = controller.period
 
     @property

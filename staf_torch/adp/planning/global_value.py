@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ...lanes import Program, scan
 from ...lanes.gradients import without_gradient
-from ...numerics.checks import fail, integer, positive_real, trailing, vector
+from ...numerics.checks import fail, integer, positive, positive_real, trailing, vector
 from ...numerics.kept_precision import KeptPrecision
 from ..problem.rules import check_endless, check_regulator
 from ..problem.sampled import SampledProblem
@@ -23,6 +23,12 @@ _TOGETHER = 4096  # candidates rolled out at once
 _ROUND = 0.01  # share of the metric that counts every coordinate, also one of which no cost depends
 _REACH = 0.3  # of the region: a rollout that ends further from what it follows has lost it
 _ARRIVED = 0.01  # share of a trajectory's cost that may be the terminal value: else it did not reach the goal
+
+
+def half_widths(call: str, region: Sequence[float] | Tensor, dim: int) -> Tensor:
+    """Return half the width of a box of states, (n,) float64, positive."""
+    given = vector(call, "region", region if isinstance(region, Tensor) else list(region), dim)
+    return positive(call, "region", torch.tensor(given, dtype=torch.float64, device="cpu"))
 
 
 def check_memorable(call: str, problem: SampledProblem) -> None:
@@ -102,12 +108,10 @@ class GlobalValue(KeptPrecision):
         super().__init__()
         check_memorable("GlobalValue", problem)
         self.problem, self.library = problem, library
-        width = region.tolist() if isinstance(region, Tensor) else list(region)
-        if min(vector("GlobalValue", "region", width, problem.dim)) <= 0:
-            raise fail("GlobalValue", "region", "must be positive", width)
+        width = half_widths("GlobalValue", region, problem.dim)
         self.lookahead = integer("GlobalValue", "lookahead", lookahead, least=1)
         self.spacing = positive_real("GlobalValue", "spacing", spacing)
-        self.register_buffer("region", torch.tensor(width, dtype=torch.float64, device="cpu"))
+        self.register_buffer("region", width)
         self.region: Tensor
         arrives = library.value[:, -1] <= _ARRIVED * library.cost + 1e-9
         self.arrives = arrives & torch.isfinite(library.cost)

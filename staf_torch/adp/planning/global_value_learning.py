@@ -17,7 +17,7 @@ from ...numerics.checks import fail, integer, real
 from ...signs import Sign
 from ..problem.sampled import SampledProblem
 from .ddp import BoxDDP
-from .global_value import GlobalValue, check_memorable
+from .global_value import GlobalValue, check_memorable, half_widths
 from .trajectories import Reference, Trajectories, chosen, rows_of
 
 _log = logging.getLogger(__name__)
@@ -96,7 +96,7 @@ def learn_global_value(
     integer("learn_global_value", "rounds", rounds, least=0)
     integer("learn_global_value", "states", states, least=1)
     generator = torch.Generator().manual_seed(integer("learn_global_value", "seed", seed, least=0))
-    width = torch.as_tensor(region, dtype=torch.float64, device=getattr(region, "device", "cpu"))
+    width = half_widths("learn_global_value", region, problem.dim)
     search = BoxDDP(problem, steps=steps, iterations=40, tolerance=1e-5)
 
     def memory(library: Trajectories) -> GlobalValue:

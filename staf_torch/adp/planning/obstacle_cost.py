@@ -176,7 +176,7 @@ def plan_around(
     check_objects("plan_around", plant=plant, cost=cost)
     object_of("plan_around", AvoidanceCost, cost=cost)
     integer("plan_around", "steps", steps, least=4)
-    if not shrink:
+    if not len(shrink):
         raise fail("plan_around", "shrink", "must have at least one share", shrink)
     cost = copy.deepcopy(cost)  # its weight is going to change
     weight = all_rows(cost.weight)
