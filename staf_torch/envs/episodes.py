@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import pkgutil
 from collections.abc import Callable, Sequence
@@ -19,6 +20,8 @@ from ..adp.loop.drawing import points_of_steps
 from ..adp.loop.step import ClosedLoop, LoopState
 from ..adp.problem.shapes import check_problem
 from ..lanes.gradients import refuse_gradient
+from ..lanes.row_numbers import all_rows, over_rows
+from ..lanes.row_objects import counts_of_rows
 from ..numerics.checks import choice, fail, one_or_each, positive, positive_real
 from ..systems import Bounds, ControlAffineSystem, Plant
 
@@ -66,10 +69,12 @@ def make_bounds(plant: Plant, cost: Cost, bound: float | None) -> Bounds:
 
 
 def make_spaces(plant: Plant, limit: float, bounds: Bounds) -> tuple[spaces.Box, spaces.Box]:
-    """Observations: the state, each coordinate within the limit. Actions: the inputs within their bounds."""
+    """Observations: the state, each coordinate within the limit. Actions: the inputs within their bounds, of
+    numbers of rows the widest."""
     assert plant.dim is not None
     seen = spaces.Box(-limit, limit, (plant.dim,), np.float64)
-    return seen, spaces.Box(bounds.low.numpy(), bounds.high.numpy(), (plant.inputs,), np.float64)
+    low, high = (all_rows(limit).reshape(-1, plant.inputs) for limit in (bounds.low, bounds.high))
+    return seen, spaces.Box(low.amin(0).numpy(), high.amax(0).numpy(), (plant.inputs,), np.float64)
 
 
 def to_control(action: Numbers | Tensor, shape: tuple[int, ...], bounds: Bounds) -> Tensor:
@@ -81,10 +86,12 @@ def to_control(action: Numbers | Tensor, shape: tuple[int, ...], bounds: Bounds)
     u = torch.as_tensor(action, device=getattr(action, "device", "cpu")).detach().to("cpu", torch.float64)
     if u.shape != shape:
         raise fail("step", "action", f"must have the shape {shape}", tuple(u.shape))
-    if not bool(bounds.contain(u).all()):
-        box = ", ".join(
-            f"[{a:g}, {b:g}]" for a, b in zip(bounds.low.tolist(), bounds.high.tolist(), strict=True)
-        )
+    low, high = (all_rows(limit).expand(shape) for limit in (bounds.low, bounds.high))
+    outside = ~((u >= low) & (u <= high)).reshape(-1, shape[-1]).all(-1)
+    if bool(outside.any()):
+        row = int(outside.nonzero()[0])
+        sides = (limit.reshape(-1, shape[-1])[row].tolist() for limit in (low, high))
+        box = ", ".join(f"[{a:g}, {b:g}]" for a, b in zip(*sides, strict=True))
         rule = f"must lie in {box} (make the environment with a larger `bound`, or clip)"
         raise fail("step", "action", rule, u)
     return u
@@ -180,7 +187,10 @@ class Episodes:
         self.loop = ClosedLoop(_HeldControl(), system, cost, dt=dt, limit=limit)
         self.steps = math.ceil(horizon / self.loop.dt - 1e-9)
         self.penalty = positive_real("Episodes", "penalty", penalty)
-        self.state = cost.q.new_zeros(rows, cost.dim)
+        for count in counts_of_rows(system, cost) - {rows}:
+            rule = f"must be {count}, as many rows as plant and cost have numbers of (`PlantVectorEnv`)"
+            raise fail("Episodes", "rows", rule, rows)
+        self.state = all_rows(cost.q).new_zeros(rows, cost.dim)
         self.age = torch.zeros(rows, dtype=torch.int64, device="cpu")
 
     def begin(self, rows: Tensor, x0: Tensor) -> None:
@@ -202,7 +212,7 @@ class Episodes:
         none = self.state.new_zeros(len(u))
         before = LoopState(self.state, none, alive, self.age, none, u.to(self.state))
         with torch.no_grad():
-            after, _ = self.loop(before, self.state.new_zeros(len(u), 0, self.state.shape[1]))
+            after, _ = over_rows(self.loop, before, self.state.new_zeros(len(u), 0, self.state.shape[1]))
         self.state = after.x
         self.age = self.age + 1
         reward = -torch.where(after.alive, after.cost, self.penalty)
@@ -262,11 +272,12 @@ class Agent:
         x = seen.reshape(-1, seen.shape[-1])
         with torch.no_grad():
             if self._carried is None:
-                self._carried = self.controller.init(x)
+                self._carried = over_rows(self.controller.init, x)
                 self._steps = 0
             seeds = range(self.seed, self.seed + len(x))
             uniform = points_of_steps(x, seeds, self._steps, 1, self.controller.draws)[:, 0]
             self._steps += 1
-            u, self._carried = self.controller.step(x, self._carried, uniform, self.dt)
+            step = functools.partial(self.controller.step, dt=self.dt)
+            u, self._carried = over_rows(step, x, self._carried, uniform)
         control: Numbers = u.reshape(*seen.shape[:-1], -1).numpy()
         return control if self.action is None else self.action(control)

@@ -77,10 +77,10 @@ class PlantEnv(gymnasium.Env):
         self.plant = make_plant(plant)
         self.cost = make_cost(self.plant, cost)
         self.bounds = make_bounds(self.plant, self.cost, bound)
-        self.observation_space, self.action_space = make_spaces(self.plant, limit, self.bounds)
         self.episodes = Episodes(
             self.plant, self.cost, 1, dt=dt, horizon=horizon, limit=limit, penalty=penalty
         )
+        self.observation_space, self.action_space = make_spaces(self.plant, limit, self.bounds)
         self.spread = make_spread("PlantEnv", self.plant, spread)
 
     def reset(
@@ -120,7 +120,7 @@ class PlantVectorEnv(VectorEnv):
 
     Args:
         plant, cost, dt, horizon, spread, bound, limit, penalty: as in `PlantEnv`.
-        num_envs: B.
+        num_envs: B; that of the rows where plant or cost have numbers of a row's own (`staf_torch.rows`).
         autoreset_mode: when a finished row begins anew: at its next step, whose action is then ignored
             (Gymnasium's default), in the same step (the last observation is ``info["final_obs"]``), or by
             ``reset(options={"reset_mask": mask})`` alone.
@@ -151,12 +151,12 @@ class PlantVectorEnv(VectorEnv):
         self.plant = make_plant(plant)
         self.cost = make_cost(self.plant, cost)
         self.bounds = make_bounds(self.plant, self.cost, bound)
-        self.single_observation_space, self.single_action_space = make_spaces(self.plant, limit, self.bounds)
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
         self.episodes = Episodes(
             self.plant, self.cost, num_envs, dt=dt, horizon=horizon, limit=limit, penalty=penalty
         )
+        self.single_observation_space, self.single_action_space = make_spaces(self.plant, limit, self.bounds)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
         self.spread = make_spread("PlantVectorEnv", self.plant, spread)
         self._generators: list[np.random.Generator] = []
         self._over = torch.zeros(num_envs, dtype=torch.bool, device="cpu")

@@ -87,10 +87,16 @@ def refuse_rows(call: str, instead: str = "make one for each row", **given: Any)
     Raises:
         ValueError: that names the first one.
     """
-    for name, value in given.items() if RowNumbers.made else ():
-        if any(isinstance(tensor, RowNumbers) for tensor in Contents(value).tensors):
+    for name, value in given.items():
+        if counts_of_rows(value):
             rule = "must have no numbers of a row's own (`staf_torch.rows`), which are not served here"
             raise ValueError(f"`{call}({name}=...)` {rule}: {instead}.")
+
+
+def counts_of_rows(*objects: Any) -> set[int]:
+    """Return of how many rows objects hold numbers; no number where they hold none of rows."""
+    tensors = Contents(*objects).tensors if RowNumbers.made else ()
+    return {len(tensor.full) for tensor in tensors if isinstance(tensor, RowNumbers)}
 
 
 def by_rows(function: Callable[Given, Some]) -> Callable[Given, Some]:

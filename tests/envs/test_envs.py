@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from staf_torch import (
     StateRadius,
     adp,
     rings,
+    rows,
     systems,
 )
 from staf_torch.lanes import philox
@@ -66,6 +68,31 @@ def test_row_of_the_vectorised_environment_is_the_single_one(name: str) -> None:
             for found, wanted in zip(one.step(action[row])[:4], expected, strict=True):
                 np.testing.assert_allclose(found, wanted[row], rtol=1e-14, atol=1e-14)
     assert histories[-1][3].all()  # truncated at the horizon
+
+
+def test_environments_of_plants_with_numbers_of_their_own_are_single_ones() -> None:
+    numbers = {"mass": [0.5, 1.0, 2.0], "weight": [1.0, 2.0, 3.0], "high": [1.0, 2.0, math.inf]}
+
+    def made(mass: Any, weight: Any, high: Any, count: int = 1) -> Any:
+        cost = adp.QuadraticCost(weight, 1.0, 2, 1, low=-1.0, high=high)
+        plant = systems.Pendulum(mass=mass)
+        environment = gymnasium.make_vec(envs.OWN_PLANT, num_envs=count, plant=plant, cost=cost)
+        return environment, envs.Agent(adp.LQR(plant, cost))
+
+    def played(environment: Any, agent: Any, seed: int) -> list[Any]:
+        seen, _ = environment.reset(seed=seed)
+        action = np.clip(agent(seen), -0.9, 0.9)
+        return [seen, action, *environment.step(action)[:2]]
+
+    own = {name: rows(torch.tensor(column).double()) for name, column in numbers.items()}
+    many = made(**own, count=3)
+    for row, each in enumerate(zip(*numbers.values(), strict=True)):
+        for found, wanted in zip(played(*many, 7), played(*made(*each), 7 + row), strict=True):
+            np.testing.assert_array_equal(found[row], wanted[0])
+    with pytest.raises(ValueError, match=r"must lie in \[-1, 1\]"):
+        many[0].step(np.full((3, 1), 1.5))
+    with pytest.raises(ValueError, match=r"must be 3, as many rows as plant and cost .*; got 2"):
+        made(**own, count=2)
 
 
 @pytest.mark.parametrize("make", [lambda: adp.Feedback(LQR), rollout, learner])
