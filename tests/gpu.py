@@ -68,6 +68,8 @@ KINDS: dict[str, tuple[Make, tuple[int, ...]]] = {
     "RolloutPolicy": (cases.rollouts, (1000, 100_000)),
     "mass of a row's own": (cases.masses, (1000, 1_000_000)),
     "chase, everything": (cases.everything, (100_000,)),
+    "streams, M = 6": (cases.streams(2, 6), (1000, 100_000)),
+    "streams, a width of each": (cases.streams(2, 3, own=True), (100_000,)),
 }
 for _count, _law in itertools.product((3, 6, 15), cases.LAWS):
     # Of more iterations these make ten digits of a rounding.

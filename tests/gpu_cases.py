@@ -298,3 +298,23 @@ def turned(rows: int, dtype: torch.dtype) -> Case:
     u = torch.randn(24, 3, rows, dtype=dtype).permute(2, 0, 1)[:, ::2]
     now = u, torch.rand(rows, 12) > 0.5, torch.arange(12).expand(rows, 12)
     return of_program(lanes.Program(step), torch.randn(3, rows, dtype=dtype).mT, now, (), times=12)
+
+
+def streams(dim: int, count: int, own: bool = False) -> Callable[[int, torch.dtype], Case]:
+    """The filter of as many streams: a stretch learned, and the next sample expected."""
+
+    def case(rows: int, dtype: torch.dtype) -> Case:
+        widths = 0.9 * dim**0.5 * (0.9 + 0.2 * (0.37 * torch.arange(rows, dtype=torch.float64)).frac())
+
+        def call(x: Tensor, y: Tensor) -> Any:
+            width = st.rows(widths[: len(x)].to(x.device)) if own else 0.9 * dim**0.5
+            model = st.StaFRegressor(st.GaussianKernel(width), 0.4, count, noise=0.05)
+            model.fit(x.transpose(0, 1), y.transpose(0, 1))
+            return model.predict(x[:, 0], return_std=True)
+
+        row, time = torch.arange(rows, dtype=torch.float64).view(-1, 1, 1), torch.arange(100).view(-1, 1)
+        x = (0.05 * time * torch.linspace(1, 1.7, dim) + 0.61 * row * torch.linspace(1, 2, dim)).sin()
+        y = (2 * x).sin().sum(-1) + 0.05 * (7.3 * time.squeeze(1) + row.squeeze(2)).sin()
+        return of_function(call, x.to(dtype), y.to(dtype), times=100)
+
+    return case

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -86,11 +88,31 @@ def test_a_chase_follows_the_states(kernel: str, law: str) -> None:
     agree(chased(there(states)), chased(states))
 
 
-@pytest.mark.parametrize("kind", [st.StaFRegressor, online.MixtureRegressor])
-def test_streams_take_samples_of_a_device(kind: Any) -> None:
-    x = torch.stack((torch.arange(12.0).cos(), torch.arange(12.0).sin()), -1).double()
-    one, other = (kind().fit(place(x), place(x).sum(-1)) for place in (Tensor.clone, there))
-    agree(other.predict(there(x[3])), one.predict(x[3]))
+WIDTHS = torch.linspace(0.5, 1.5, 2, dtype=torch.float64)
+REGRESSORS: dict[str, Callable[[Tensor, Tensor], Any]] = {
+    "filter": lambda x, y: st.StaFRegressor(),
+    "numbers of a stream's own": lambda x, y: st.StaFRegressor(
+        st.GaussianKernel(st.rows(WIDTHS)), noise=st.rows(WIDTHS)
+    ),
+    "tuned": lambda x, y: st.StaFRegressor(count=3).tune(x, y),
+    "kernel in plain torch": lambda x, y: st.StaFRegressor("matern", count=3),
+    "mixture": lambda x, y: online.MixtureRegressor(),
+}
+
+
+@pytest.mark.parametrize("name", REGRESSORS)
+def test_streams_take_samples_of_a_device_and_a_copy_goes_on_there(name: str) -> None:
+    angle = torch.arange(6, dtype=torch.float64).unsqueeze(-1) + torch.arange(2)
+    x = torch.stack((angle.cos(), angle.sin()), -1)
+
+    def predicted(x: Tensor) -> list[Tensor]:
+        y = x.sum(-1)
+        model = REGRESSORS[name](x, y)
+        found = [copy.deepcopy(model.fit(x, y)).partial_fit(x[0], y[0]).predict(x[3])]
+        return [*found, model.forecast(x, y).mean] if hasattr(model, "forecast") else found
+
+    for one, other in zip(predicted(there(x)), predicted(x), strict=True):
+        agree(one, other)
 
 
 def test_a_design_of_a_device_is_that_of_the_cpu() -> None:

@@ -13,11 +13,13 @@ import torch
 from torch import Tensor
 
 from ..lanes.compiler import compiled
-from ..lanes.log import say
-from .kalman_filter import LocalFilter, StreamState, blocks_of
+from ..lanes.when_compiled import runs_kernels, worth
+from .filter_program import KernelFilter
+from .kalman_filter import LocalFilter
 from .local_functions import LocalFunctions
 from .own_functions import OwnFunctions
 from .samples import in_place
+from .stream_state import StreamState, blocks_of
 
 NATIVE = Path(__file__).with_name("native")
 """The folder of the C++ of this room."""
@@ -135,18 +137,20 @@ class CompiledFilter:
         self.short = streams * state.count**2 <= _SHORT
 
     @classmethod
-    def build(cls, definition: LocalFilter, state: StreamState) -> CompiledFilter | LocalFilter:
-        """The compiled filter, or the definition where there is none."""
+    def build(
+        cls, definition: LocalFilter, state: StreamState
+    ) -> CompiledFilter | KernelFilter | LocalFilter:
+        """The compiled filter, kernels of a device, or the definition where there is neither."""
         functions, real = definition.functions, _REALS.get(state.dtype)
         own = isinstance(functions, OwnFunctions)
         plain = isinstance(functions, OwnFunctions) or (
             functions.rate is not None and functions.shared is not None and functions.stationary
         )
-        where = state.blocks.device
-        if where.type not in ("cpu", "meta"):
-            told = f"its machine code is of the processor, and the samples are on {where}; `x.cpu()` runs it"
-            say("the filter of streams", told)
-        if not plain or real is None or state.count > _MOST or where.type != "cpu":
+        if not plain or real is None or state.count > _MOST:
+            return definition
+        if runs_kernels(state.blocks) and worth(True, state.blocks):
+            return KernelFilter(definition, state)
+        if not state.blocks.is_cpu:
             return definition
         sizes = f"DIM={state.dim}", f"COUNT={state.count}", f"OUTPUTS={state.outputs}"
         call = compiled(NATIVE / "_filter.cpp", *sizes, f"REAL={real}", *(["OWN=1"] if own else []))

@@ -6,7 +6,7 @@ import abc
 import numbers
 import sys
 from collections.abc import Callable
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -22,34 +22,10 @@ from ..signs import Sign
 from .compiled_filter import DirectCalls
 from .samples import in_place, lapse_of, lapses, like_given, pair, single, tensor_of
 from .scikit_estimator import NotFittedError, ScikitEstimator, parameters, told_kernel
+from .streams import Streams
 
 _ABOUT = ("n_features_in_", "n_streams_", "n_outputs_")
 _DTYPES = {str(dtype): dtype for dtype in (torch.float32, torch.float64)}
-
-
-class Streams(Protocol):
-    """Streams side by side, none of which influences another: a `FilterStreams` or a `Bank`."""
-
-    dtype: torch.dtype
-
-    @property
-    def compiled(self) -> bool: ...  # tensors of this dtype are read in place by compiled code
-    @property
-    def count(self) -> int: ...  # S
-    @property
-    def learned(self) -> Tensor: ...  # samples, (S,) int64
-    @property
-    def skipped(self) -> Tensor: ...
-    def predict(  # mean and deviation of the next y at x (S, n), in a shape
-        self, x: Tensor, shape: tuple[int, ...] | None = None
-    ) -> tuple[Tensor, Tensor]: ...
-    def learn(self, x: Tensor, y: Tensor, lapse: Tensor | None = None) -> None: ...
-    def direct(self, shape: tuple[int, ...], targets: tuple[int, ...]) -> DirectCalls | None: ...
-    def clear(self, rows: Tensor) -> None: ...  # these streams begin anew
-    def add(self, streams: int) -> None: ...  # behind the others
-    def keep(self, rows: Tensor) -> None: ...  # these alone
-    def state_dict(self) -> dict[str, Tensor]: ...
-    def load_state_dict(self, state: dict[str, Tensor]) -> None: ...
 
 
 class StreamEstimator(ScikitEstimator, abc.ABC):
@@ -105,7 +81,8 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         states, values = pair(self._call("fit"), x, y, (2, 3))
         lapse, twin = lapses(self._call("fit"), time, states), self._twin()
         with Sign(self._call("fit"), len(states), "samples") as sign:
-            for k, (state, value) in enumerate(zip(states, values, strict=True)):
+            one_by_one = () if twin._stretch(states, values, lapse) else zip(states, values, strict=True)
+            for k, (state, value) in enumerate(one_by_one):
                 if lapse is None:
                     twin.partial_fit(state, value)
                 else:
@@ -113,6 +90,18 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
                 sign.advance()
         self._change(self._take_over, twin)
         return self
+
+    @beside
+    def _stretch(self, states: Tensor, values: Tensor, lapse: Tensor | None) -> bool:
+        """Begin with a stretch, and learn it in one call; False where samples are learned one by one."""
+        self._prepare(states[0], values[0])
+        streams, times = self._streams_, len(states)
+        x, y = (
+            self._placed("fit", name, part).reshape(times, streams.count, -1)
+            for name, part in (("x", states), ("y", values))
+        )
+        steps = x.new_ones(times, 1, dtype=torch.float64) if lapse is None else lapse
+        return streams.stretch(x, y, steps.expand(times, streams.count))
 
     def _twin(self) -> Self:
         """Return a regressor with the same arguments that has learned nothing."""
@@ -257,9 +246,9 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         """Return a sample in the dtype of the streams.
 
         Raises:
-            ValueError: if it is on another device than the first sample.
+            ValueError: if it is on another device than the first sample, and the streams take none there.
         """
-        if value.device != self._device_:
+        if value.device != self._device_ and not self._streams_.moves:
             rule = f"must be on {self._device_}, where the first sample was"
             raise ValueError(f"`{self._call(call)}({name}=...)` {rule}; got one on {value.device}.")
         real = self._streams_.dtype
@@ -405,7 +394,8 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
                 told = f"must be of a regressor with the same arguments: it has {key}={its}, this one {mine}"
                 raise ValueError(f"`{name}(state=...)` {told}.")
         leading = () if streams is None else (streams,)
-        x = torch.zeros(*leading, state["n_features_in_"], dtype=dtype, device="cpu")
+        where = getattr(state["table"], "device", torch.device("cpu"))
+        x = torch.zeros(*leading, state["n_features_in_"], dtype=dtype, device=where)
         twin._prepare(x, x.new_zeros((*leading, *(() if outputs is None else (outputs,)))))
         with on(x.device):
             twin._streams_.load_state_dict(state)

@@ -8,8 +8,10 @@ import torch
 from torch import Tensor
 
 from .compiled_filter import CompiledFilter, DirectCalls
-from .kalman_filter import STREAK, LocalFilter, StreamState
+from .filter_program import KernelFilter
+from .kalman_filter import STREAK, LocalFilter
 from .own_functions import OwnFunctions
+from .stream_state import StreamState
 
 LEARNED_AT = (2, 5, 10, 20, 40)  # samples after which the units are learned
 OUTLYING = 30.0  # median deviations beyond which a value has no say in them
@@ -30,6 +32,8 @@ class FilterStreams:
         may_grow: 1 for coordinates whose units grow with what they are seen to move by, (S, n); by default
             all where units are learned, none where they are known.
     """
+
+    moves = False
 
     def __init__(
         self,
@@ -105,6 +109,13 @@ class FilterStreams:
         n = self.state.dim
         mean, deviation = self._filter.predict(self.state, (x - self._center[:, :n]) / self._spread[:, :n])
         return mean * self._spread[:, n:] + self._center[:, n:], deviation * self._spread[:, n:]
+
+    def stretch(self, x: Tensor, y: Tensor, lapse: Tensor) -> bool:
+        """Learn a stretch in one call, (T, S, n), (T, S, K), (T, S); False where it is sample by sample."""
+        if self.scaling or not isinstance(self._filter, KernelFilter):
+            return False
+        self._filter.stretch(self.state, x, y, lapse)
+        return True
 
     def learn(self, x: Tensor, y: Tensor, lapse: Tensor | None = None) -> None:
         """Learn one sample a stream: (S, n), (S, K), (S,)."""

@@ -10,11 +10,10 @@ from torch import Tensor
 
 from ..lanes import Program
 from ..lanes.tree import Tree
-from .kalman_filter import Counts, LocalFilter, StateParts
-from .local_functions import LocalFunctions
+from .filter_program import FORECAST, after, law_of
+from .kalman_filter import LocalFilter
 from .own_functions import OwnFunctions
-
-_NUMBERS = torch.finfo(torch.float64)
+from .stream_state import Counts
 
 
 class Forecast(NamedTuple):
@@ -45,17 +44,16 @@ def forecasts(filter_: LocalFilter, x: Tensor, y: Tensor, lapse: Tensor) -> tupl
         lapse: (S, T).
     """
     rows, functions = len(x), filter_.functions
-    law = (filter_.ratio, filter_.forgetting, filter_.slack, filter_.robust, filter_.base)
-    numbers = tuple(torch.as_tensor(part, device=x.device).double().expand(rows) for part in law)
+    numbers = tuple(torch.as_tensor(part, device=x.device).double().expand(rows) for part in law_of(filter_))
     if isinstance(functions, OwnFunctions):
         row = tuple(part.movedim(-1, 0).to(x.device) for part in functions), numbers
-        mean, deviation = _FILTER(_fresh(x, y, functions.offsets.shape[0]), (x, y, lapse), row)[1]
+        mean, deviation = FORECAST(_fresh(x, y, functions.offsets.shape[0]), (x, y, lapse), row)[1]
         return mean, deviation
 
     def step(carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
-        return _after(functions, carry, now, row)
+        return after(functions, carry, now, row)
 
-    program = Program(step, name=_FILTER.name, compile=False)
+    program = Program(step, name=FORECAST.name, compile=False)
     mean, deviation = program(_fresh(x, y, len(functions.offsets)), (x, y, lapse), numbers)[1]
     return mean, deviation
 
@@ -69,32 +67,3 @@ def _fresh(x: Tensor, y: Tensor, count: int) -> Tree:
     rest = [new(rows, k) for _ in range(7)]
     parts = (nowhere, nowhere, new(rows, k + 1, count), new(rows, lower), *rest, new(rows, 1), new(rows, 1))
     return parts, tuple(new(rows, dtype=torch.int64) for _ in Counts._fields)
-
-
-def _step(carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
-    """Expect a sample, and learn it: streams are the first dimension."""
-    functions, law = row
-    return _after(OwnFunctions(*(part.movedim(0, -1) for part in functions)), carry, now, law)
-
-
-def _after(functions: LocalFunctions | OwnFunctions, carry: Tree, now: Tree, law: Tree) -> tuple[Tree, Tree]:
-    (parts, counts), (x, y, lapse) = carry, now
-    ratio, forgetting, slack, robust, base = law
-    filter_ = LocalFilter(functions, ratio, forgetting, slack, robust, base)
-    old = StateParts(*(part.movedim(0, -1) for part in parts))
-    count = old.mean.shape[1]
-    entries = [(i, j) for i in range(count) for j in range(count)]
-    whole = old.learned[[max(i, j) * (max(i, j) + 1) // 2 + min(i, j) for i, j in entries]]
-    whole = whole.unflatten(0, (count, count))
-    # what counts values has no derivative
-    still = {name: getattr(old, name).detach() for name in ("surprises", "told", "leaps")}
-    old = old._replace(learned=whole, **still)
-    x, y = x.mT, y.mT
-    expected = filter_.expected(old, x, forgetting**lapse)
-    new, seen = filter_.learned(old, Counts(*counts), x, y, lapse, _NUMBERS)
-    lower = new.learned.flatten(0, 1)[[count * i + j for i, j in entries if j <= i]]
-    after = tuple(part.movedim(-1, 0) for part in new._replace(learned=lower))
-    return (after, tuple(seen)), tuple(part.mT for part in expected)
-
-
-_FILTER = Program(_step, name="StaFRegressor over a stretch")

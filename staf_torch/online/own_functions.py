@@ -78,7 +78,9 @@ def has_rows(numbers: dict[str, Any], kernel: Kernel) -> bool:
     return any(isinstance(value, RowNumbers) for value in found)
 
 
-def own_law(call: str, numbers: dict[str, Any], dtype: torch.dtype, streams: int) -> dict[str, Tensor]:
+def own_law(
+    call: str, numbers: dict[str, Any], dtype: torch.dtype, streams: int, like: Tensor
+) -> dict[str, Tensor]:
     """Return the checked arguments, (S,) each.
 
     Args:
@@ -86,19 +88,20 @@ def own_law(call: str, numbers: dict[str, Any], dtype: torch.dtype, streams: int
         numbers: of `NAMES`.
         dtype: of the streams.
         streams: S.
+        like: a tensor where they are to be.
     """
 
     def column(name: str, value: Any) -> Tensor:
         sign = "not negative" if name == "follow" else "positive"
         checked = own_number(call, name, value, sign)
         if isinstance(checked, RowNumbers):
-            return columns([checked], streams)[0].double()
+            return columns([checked], streams)[0].to(like.device).double()
         if isinstance(checked, Tensor):
-            return checked.double().expand(streams)
-        return torch.full((streams,), checked, dtype=torch.float64, device="cpu")
+            return checked.to(like.device).double().expand(streams)
+        return like.new_full((streams,), checked, dtype=torch.float64)
 
     found = {name: column(name, value) for name, value in numbers.items() if value is not None}
-    found.setdefault("robust", torch.full((streams,), torch.inf, dtype=torch.float64, device="cpu"))
+    found.setdefault("robust", like.new_full((streams,), torch.inf, dtype=torch.float64))
     least = math.sqrt(64 * torch.finfo(dtype).eps)
     rules = (
         ("noise", found["noise"] >= least * found["amplitude"], f"must be at least {least:.1e} amplitude"),
@@ -123,4 +126,4 @@ def own_functions(call: str, kernel: Kernel, radius: Tensor, toward: Tensor) -> 
         if isinstance(rate, RowNumbers)
         else all_rows(rate).expand(len(radius))
     )
-    return OwnFunctions.of(rates.double(), radius[:, None, None] * toward.double())
+    return OwnFunctions.of(rates.to(radius.device).double(), radius[:, None, None] * toward.double())

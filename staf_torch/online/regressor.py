@@ -17,16 +17,18 @@ from ..kernels import NAMED, GaussianKernel, Kernel
 from ..lanes.gradients import refuse_gradient
 from ..lanes.row_numbers import RowNumbers
 from ..numerics.checks import choice, fail, flag, integer, positive_real, real
-from ..numerics.default_device import on
+from ..numerics.default_device import device_of, on
 from ..signs import Sign
-from .estimator import StreamEstimator, Streams
+from .estimator import StreamEstimator
 from .filter_streams import FilterStreams
 from .forecasts import Forecast, forecasts, log_density
-from .kalman_filter import LocalFilter, StreamState
+from .kalman_filter import LocalFilter
 from .local_functions import LocalFunctions
 from .own_functions import NAMES, OwnFunctions, has_rows, own_functions, own_law
 from .samples import lapses, like_given, pair, single, tensor_of
 from .smoothing import smooth_record
+from .stream_state import StreamState
+from .streams import Streams
 from .tuning import CENTERS, Tuning, tuned_streams, tuning
 from .turning_streams import TurningStreams, turned_in_time
 
@@ -156,7 +158,7 @@ class StaFRegressor(StreamEstimator):
         targets = values if values.dim() == states.dim() else values.unsqueeze(-1)
         rows = [part.unsqueeze(1) if states.dim() == 2 else part for part in (states, targets)]
         with on(states.device):
-            directions = self._directions(states.shape[-1])
+            directions = self._directions(states.shape[-1], states.device)
             if method == "gradient" and len(directions) > CENTERS:
                 rule = f"must be 'search' for more than {CENTERS} centers, of which {states.shape[-1]} "
                 rule += (
@@ -247,7 +249,7 @@ class StaFRegressor(StreamEstimator):
         sides = [part.transpose(0, 1) for part in ((at - center[:, :n]) / spread[:, :n], late)]
         goal = ((of - center[:, n:]) / spread[:, n:]).transpose(0, 1)
         with on(states.device):
-            filter_ = self._recorded_filter(count, outputs, n)
+            filter_ = self._recorded_filter(count, outputs, at[0, 0])
             found = forecasts(filter_, sides[0], goal, sides[1])
         mean = found[0].transpose(0, 1) * spread[:, n:] + center[:, n:]
         deviation = found[1].transpose(0, 1) * spread[:, n:]
@@ -264,16 +266,16 @@ class StaFRegressor(StreamEstimator):
         assert isinstance(streams, FilterStreams)
         return streams.units_for(torch.cat((at, of), -1))
 
-    def _recorded_filter(self, streams: int, outputs: int, dim: int) -> LocalFilter:
-        """Return the filter of tensors that autograd sees."""
-        toward, found = self._directions(dim), self._tuned(streams, dim, outputs)
+    def _recorded_filter(self, streams: int, outputs: int, like: Tensor) -> LocalFilter:
+        """Return the filter of tensors that autograd sees, for states like (n,)."""
+        toward, found = self._directions(len(like), like.device), self._tuned(streams, outputs, like)
         robust = math.inf if self.robust is None else self.robust
         if found is not None:
             radius = found.radius[:1].expand(streams)
             tuned = own_functions(_NAME, GaussianKernel(1.0), radius, toward)
             slack = float(single(self.follow)) * radius
             return LocalFilter(tuned, found.ratio, found.forgetting, slack, robust)
-        law = own_law(_NAME, {name: getattr(self, name) for name in NAMES}, torch.float64, streams)
+        law = own_law(_NAME, {name: getattr(self, name) for name in NAMES}, torch.float64, streams, like)
         kernel = self.kernel if isinstance(self.kernel, Kernel) else _kernel(self.kernel)
         rate, ratio = kernel.exponent_rate(), (law["noise"] / law["amplitude"]).square()
         slack, base = (law["follow"] * law["radius"]).detach(), law["amplitude"].square()
@@ -282,23 +284,27 @@ class StaFRegressor(StreamEstimator):
         if plain or isinstance(self.radius, RowNumbers):
             functions = own_functions(_NAME, kernel, law["radius"], toward)
         else:
+            if like.device != device_of(kernel) and not any(p.requires_grad for p in kernel.parameters()):
+                kernel = copy.deepcopy(kernel).to(like.device)
             functions = LocalFunctions.of(kernel, law["radius"][0] * toward)
         return LocalFilter(functions, ratio, law["forgetting"], slack, law["robust"], base)
 
-    def _tuned(self, streams: int, dim: int, outputs: int) -> Tuning | None:
-        """Return what `tune` found, None before.
+    def _tuned(self, streams: int, outputs: int, like: Tensor) -> Tuning | None:
+        """Return what `tune` found, for states like (n,) and where they are; None before.
 
         Raises:
             ValueError: if it was for other streams.
         """
-        if self._tuning is not None and self._tuning.sizes != (streams, dim, outputs):
+        if self._tuning is None:
+            return None
+        if self._tuning.sizes != (streams, len(like), outputs):
             was, now = (
                 f"{s} stream(s) of {n} coordinate(s) and {k} output(s)"
-                for s, n, k in (self._tuning.sizes, (streams, dim, outputs))
+                for s, n, k in (self._tuning.sizes, (streams, len(like), outputs))
             )
             rule = "call `tune` for these, or take a new regressor"
             raise ValueError(f"`{_NAME}` was tuned for {was}; got {now}: {rule}.")
-        return self._tuning
+        return Tuning(*(part.to(like.device) for part in self._tuning))
 
     def _begin(self, streams: int, outputs: int, like: Tensor) -> Streams:
         begun, angles = self._filters(streams, outputs, like), self._angles(len(like))
@@ -313,8 +319,8 @@ class StaFRegressor(StreamEstimator):
         return tuple(sorted({index % dim for index in self.periodic}))
 
     def _filters(self, streams: int, outputs: int, like: Tensor) -> FilterStreams:
-        dim, dtype, toward = len(like), like.dtype, self._directions(len(like))
-        scaling, found = flag(_NAME, "scaling", self.scaling), self._tuned(streams, dim, outputs)
+        dim, dtype, toward = len(like), like.dtype, self._directions(len(like), like.device)
+        scaling, found = flag(_NAME, "scaling", self.scaling), self._tuned(streams, outputs, like)
         kernel, numbers = _kernel(self.kernel), {name: getattr(self, name) for name in NAMES}
         refuse_gradient(_NAME, **numbers)
         if found is None and has_rows(numbers, kernel):
@@ -328,7 +334,7 @@ class StaFRegressor(StreamEstimator):
         follow = real(_NAME, "follow", single(self.follow))
         if follow < 0:
             raise fail(_NAME, "follow", "must not be negative", self.follow)
-        self.centers_offsets_ = offsets = radius * toward.to(like.device)
+        self.centers_offsets_ = offsets = radius * toward
         kernel = kernel.to(like.device)
         if kernel.core(torch.zeros_like(offsets[0]), offsets, offsets).dim() != 2:
             raise fail(_NAME, "kernel", "must have one value a hyperparameter for all streams", self.kernel)
@@ -348,8 +354,8 @@ class StaFRegressor(StreamEstimator):
         outputs: int,
         like: Tensor,
     ) -> FilterStreams:
-        law = own_law(_NAME, numbers, like.dtype, streams)
-        functions = own_functions(_NAME, kernel, law["radius"], toward)
+        law = own_law(_NAME, numbers, like.dtype, streams, like)
+        functions = own_functions(_NAME, kernel.to(like.device), law["radius"], toward)
         self.centers_offsets_ = law["radius"][:, None, None] * toward
         ratio = (law["noise"] / law["amplitude"]).square()
         slack, base = law["follow"] * law["radius"], law["amplitude"].square()
@@ -370,18 +376,18 @@ class StaFRegressor(StreamEstimator):
             raise fail(_NAME, "forgetting", "must be in (0, 1]", self.forgetting)
         return ratio, forgetting
 
-    def _directions(self, dim: int) -> Tensor:
-        """Return the centers' directions, (M, n)."""
+    def _directions(self, dim: int, where: torch.device) -> Tensor:
+        """Return the centers' directions, (M, n), on a device."""
         if self.centers is None:
             count = math.comb(dim + 2, 2) if self.count is None else self.count
             count = integer(_NAME, "count", count, least=1)
-            return rings(count) if dim == 2 and count in RING_COUNTS else ball(count, dim)
+            return (rings(count) if dim == 2 and count in RING_COUNTS else ball(count, dim)).to(where)
         found = tensor_of(_NAME, "centers", self.centers).double()
         fits = found.dim() == 2 and found.shape[1] == dim
         if not (fits and float(found.square().sum(1).amax()) <= 1 + 1e-9):
             rule = f"must be directions (M, {dim}) in the closed unit ball"
             raise fail(_NAME, "centers", rule, self.centers)
-        return found
+        return found.to(where)
 
     def _decisive(self) -> tuple[str, ...]:
         held = ("forgetting", "follow", "robust", "scaling")

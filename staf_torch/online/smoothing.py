@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .kalman_filter import LocalFilter, StreamState
+from .kalman_filter import LocalFilter
+from .stream_state import StreamState
 
 
 def smooth_record(

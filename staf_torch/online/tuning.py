@@ -19,9 +19,10 @@ from ..kernels import GaussianKernel
 from ..numerics.default_device import designed_on_cpu
 from .filter_streams import FilterStreams, units_of
 from .forecasts import forecasts
-from .kalman_filter import LocalFilter, StreamState
+from .kalman_filter import LocalFilter
 from .local_functions import LocalFunctions
 from .own_functions import OwnFunctions
+from .stream_state import StreamState
 
 _log = logging.getLogger(__name__)
 

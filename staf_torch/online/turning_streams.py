@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..numerics.angles import turned
-from .estimator import Streams
+from .streams import Streams
 
 
 class TurningStreams:
@@ -25,7 +25,7 @@ class TurningStreams:
 
     def __init__(self, inner: Streams, periodic: Sequence[int], latest: Tensor) -> None:
         self.inner, self.periodic, self.latest = inner, tuple(periodic), latest
-        self.dtype = inner.dtype
+        self.dtype, self.moves = inner.dtype, inner.moves
 
     @property
     def compiled(self) -> bool:
@@ -59,6 +59,10 @@ class TurningStreams:
         self.inner.learn(at, y, lapse)
         rows = at.reshape(self.latest.shape)
         self.latest = torch.where(torch.isfinite(rows), rows, self.latest)
+
+    def stretch(self, x: Tensor, y: Tensor, lapse: Tensor) -> bool:
+        """Return False: each sample is turned to the one before."""
+        return False
 
     def clear(self, rows: Tensor) -> None:
         self.inner.clear(rows)

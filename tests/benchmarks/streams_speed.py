@@ -1,8 +1,8 @@
 """Processor time of streams, one thread: `python tests/benchmarks/streams_speed.py`.
 
 The filter on ten thousand streams, of which about a seventh (M = 6) and a quarter (M = 28) move their centers
-at a step; one stream, a sample a call from Python, filter and bank; and the filter of M = 6 as a row program
-of `staf_torch.lanes`, all steps in one call, against which the hand-written C++ must defend itself.
+at a step; one stream, a sample a call from Python, filter and bank; the filter of M = 6 as the row program
+that `forecast` and devices run, all steps in one call, against which the hand-written C++ must defend itself.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ sys.path[:0] = [str(Path(__file__).parents[2])]
 
 import staf_torch as st  # noqa: E402
 from staf_torch import lanes  # noqa: E402
-from staf_torch.online.local_functions import LocalFunctions  # noqa: E402
 
 NOISE, FORGETTING = 0.05, 0.999
 
@@ -64,59 +63,19 @@ def single(model: st.StaFRegressor | st.MixtureRegressor, dim: int, calls: int =
     return f"{1e6 * (time.process_time() - start) / calls:.1f} us to predict and learn"
 
 
-def row_program(dim: int, count: int) -> lanes.Program:
-    """The filter's step as torch code of one row: centers that follow, prediction, Kalman update."""
-    functions = LocalFunctions.of(st.GaussianKernel(0.9 * dim**0.5), 0.4 * st.rings(count))
-    d, newton, q = functions.offsets, functions.shared, functions.rate
-    assert newton is not None
-    assert q is not None
-    gram = functions.kernel.core(torch.zeros_like(d[0]), d, d)
-    squares, reach = d.square().sum(-1), float(d.square().sum(-1).amax().sqrt())
-    eye = torch.eye(count, dtype=torch.float64)
-
-    def step(
-        carry: tuple[Tensor, ...], now: tuple[Tensor, ...], row: object
-    ) -> tuple[tuple[Tensor, ...], Tensor]:
-        anchor, mean, learned = carry
-        x, y = now
-        z = x - anchor
-        moves = (z.square().sum(-1) > 0.16).unsqueeze(-1)
-        h = torch.where(moves, z, 0.0)
-        along, square = q * (h @ d.mT), h.square().sum(-1, keepdim=True)
-        shift = q * (square + 1e-300).sqrt() * reach
-        before, after = (along - shift).exp(), (shift - along - q * square / 2).exp()
-        half = after.unsqueeze(-1) * (gram @ (before.unsqueeze(-1) * newton))
-        transfer = torch.where(moves.unsqueeze(-1), newton.mT @ half, eye)
-        mean = (transfer @ mean.unsqueeze(-1)).squeeze(-1)
-        learned = transfer @ learned @ transfer.mT
-        z = torch.where(moves, 0.0, z)
-        psi = (q / 2 * (squares - (z.unsqueeze(-2) - d).square().sum(-1))).exp() @ newton
-        predicted = (psi * mean).sum(-1)
-        known = FORGETTING * (learned @ psi.unsqueeze(-1)).squeeze(-1)
-        spread = (1 + NOISE**2 - (psi * known).sum(-1)).unsqueeze(-1)
-        gain = psi - known
-        mean = mean + gain * ((y - predicted).unsqueeze(-1) / spread)
-        learned = FORGETTING * learned + gain.unsqueeze(-1) * (gain / spread).unsqueeze(-2)
-        return (torch.where(moves, x, anchor), mean, learned), predicted
-
-    return lanes.Program(step)
-
-
 def as_row_program(dim: int, count: int, streams: int = 10_000, steps: int = 20) -> str:
-    samples = path(streams, dim, steps, torch.float64)
-    x, y = (torch.stack([pair[k] for pair in samples], 1) for k in range(2))
-    start = x[:, 0].clone(), x.new_zeros(streams, count), x.new_zeros(streams, count, count)
-    program = row_program(dim, count)
-    _, found = program(start, (x, y))
-    model, errors = regressor(dim, count), []
+    """`forecast`: the filter's definition as a row program, every sample expected and learned."""
+    samples, model, errors = path(streams, dim, steps, torch.float64), regressor(dim, count), []
+    x, y = (torch.stack([pair[k] for pair in samples]) for k in range(2))
+    found = model.forecast(x, y).mean
     for k, (point, value) in enumerate(samples):
         if k:
-            errors.append((model.predict(point) - found[:, k]).abs().max())
+            errors.append((model.predict(point) - found[k]).abs().max())
         model.partial_fit(point, value)
     spent = []
     for _ in range(5):
         begin = time.process_time()
-        program(start, (x, y))
+        model.forecast(x, y)
         spent.append(time.process_time() - begin)
     each = 1e6 * sorted(spent)[2] / streams / steps
     return f"{each:.3f} us to predict and learn, {float(max(errors)):.1e} from the regressor"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 
 import pytest
@@ -10,12 +11,14 @@ from helpers import tensor
 from torch import Tensor
 
 import staf_torch as st
+from staf_torch import lanes
 from staf_torch.online.compiled_filter import CompiledFilter
-from staf_torch.online.kalman_filter import LocalFilter, StateParts, StreamState
+from staf_torch.online.filter_program import KernelFilter
+from staf_torch.online.kalman_filter import LocalFilter
 from staf_torch.online.local_functions import LocalFunctions
 from staf_torch.online.own_functions import OwnFunctions
+from staf_torch.online.stream_state import StateParts, StreamState
 
-FUNCTIONS = LocalFunctions.of(st.GaussianKernel(0.8), 0.5 * st.rings(6))
 INF, NAN = math.inf, math.nan
 
 
@@ -69,6 +72,19 @@ def states(steps: int) -> dict[str, Tensor]:
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 @pytest.mark.parametrize(("robust", "own"), [(INF, False), (2.0, False), (2.0, True)])
 def test_compiled_filter_is_its_definition(robust: float, own: bool, dtype: torch.dtype) -> None:
+    follow(CompiledFilter, robust, own, dtype, 6)
+
+
+@pytest.mark.needs_compiler
+@pytest.mark.parametrize(("own", "dtype", "count"), [(False, torch.float64, 3), (True, torch.float32, 1)])
+def test_filter_on_a_device_is_its_definition(own: bool, dtype: torch.dtype, count: int) -> None:
+    with lanes.device.host():
+        follow(KernelFilter, 2.0, own, dtype, count)
+
+
+def follow(kind: type, robust: float, own: bool, dtype: torch.dtype, count: int) -> None:
+    """Compare a filter of some centers with its definition, step by step."""
+    toward = st.rings(max(count, 3))[:count]
     lists = targets(float(torch.finfo(dtype).eps) ** 0.5)
     steps = max(map(len, lists.values()))
     paths = states(steps)
@@ -78,15 +94,16 @@ def test_compiled_filter_is_its_definition(robust: float, own: bool, dtype: torc
     y = torch.stack([tensor([*one, *[0.3] * (steps - len(one))]) for _, one in rows], 1).to(dtype)
     ratio = torch.linspace(1e-3, 0.1, streams, dtype=torch.float64)
     forgetting = torch.linspace(0.9, 1.0, streams, dtype=torch.float64)
-    definition = LocalFilter(FUNCTIONS, ratio, forgetting, 0.5, robust, 0.25)
+    functions: LocalFunctions | OwnFunctions = LocalFunctions.of(st.GaussianKernel(0.8), 0.5 * toward)
+    definition = LocalFilter(functions, ratio, forgetting, 0.5, robust, 0.25)
     if own:  # a kernel, a radius, a slack of every stream's
         spread = torch.linspace(0.9, 1.1, streams, dtype=torch.float64)
-        functions = OwnFunctions.of(spread / 0.64, spread[:, None, None] * 0.5 * st.rings(6))
+        functions = OwnFunctions.of(spread / 0.64, spread[:, None, None] * 0.5 * toward)
         definition = LocalFilter(functions, ratio, forgetting, 0.5 * spread, robust * spread, 0.25 * spread)
     like = torch.zeros(0, dtype=dtype)
-    fast, slow = (StreamState.empty(like, streams, 2, 6, 1) for _ in range(2))
+    fast, slow = (StreamState.empty(like, streams, 2, count, 1) for _ in range(2))
     compiled = CompiledFilter.build(definition, fast)
-    assert isinstance(compiled, CompiledFilter)
+    assert isinstance(compiled, kind)
     near = {
         "rtol": 1e-4 if dtype == torch.float32 else 1e-6,
         "atol": 1e-6 if dtype == torch.float32 else 1e-9,
@@ -118,3 +135,25 @@ def test_compiled_filter_is_its_definition(robust: float, own: bool, dtype: torc
     assert int(fast.counts[1].min()) == 0
     assert int(fast.counts[1].max()) > 10
     assert bool((fast.counts[3] < fast.counts[0]).any())  # some began afresh
+
+
+@pytest.mark.needs_compiler
+def test_a_stretch_is_learned_on_a_device_in_one_call_and_its_state_goes_on_there() -> None:
+    x = path(12).unsqueeze(1) + torch.linspace(0, 1, 5, dtype=torch.float64).view(5, 1)
+    y, time = (2 * x).sin().sum(-1), torch.cumsum(path(12)[:, 0].abs(), 0)
+    x[3, 2], y[5, 1] = NAN, NAN
+
+    def fitted(rows: slice) -> st.StaFRegressor:
+        model = st.StaFRegressor(st.GaussianKernel(0.8), 0.4, 3, noise=0.05, robust=2.0)
+        return model.fit(x[:, rows], y[:, rows], time)
+
+    wanted = fitted(slice(None)).predict(x[-1], return_std=True)
+    with lanes.device.host():
+        model, alone = fitted(slice(None)), fitted(slice(2, 3))
+        found = model.predict(x[-1], return_std=True)
+        assert torch.equal(alone.predict(x[-1, 2:3]), found[0][2:3])
+        again = copy.deepcopy(model).partial_fit(x[0], y[0])
+        step_by_step = fitted(slice(None)).partial_fit(x[0], y[0])
+        assert torch.equal(again.predict(x[1]), step_by_step.predict(x[1]))
+    for one, other in zip(found, wanted, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-12)

@@ -8,8 +8,9 @@ from helpers import tensor, uniform
 from variants import over
 
 import staf_torch as st
-from staf_torch.online.kalman_filter import LocalFilter, StreamState
+from staf_torch.online.kalman_filter import LocalFilter
 from staf_torch.online.local_functions import LocalFunctions
+from staf_torch.online.stream_state import StreamState
 
 OFFSETS = 0.5 * torch.cat((st.cross_polytope(2), torch.zeros(1, 2, dtype=torch.float64)))
 

@@ -14,8 +14,9 @@ from torch import Tensor
 from variants import KERNELS, over
 
 import staf_torch as st
-from staf_torch.online.kalman_filter import LocalFilter, StreamState
+from staf_torch.online.kalman_filter import LocalFilter
 from staf_torch.online.local_functions import LocalFunctions
+from staf_torch.online.stream_state import StreamState
 
 SEVERAL = tensor([[0.4, -0.7], [0.9, 0.3], [-0.2, 0.6]]).mT  # states (n, S)
 

@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 from ..filter_streams import units_of
-from ..kalman_filter import ERROR_RATE, STREAK, LocalFilter, StreamState, spread_with
+from ..kalman_filter import ERROR_RATE, STREAK, LocalFilter, spread_with
 from ..local_functions import LocalFunctions
+from ..stream_state import StreamState
 from .members import QuadraticModels, Stretch, TrackerModels, learn_hyperparameters, quadratic_features
 from .mixing import constant, judge, mix
 from .rules import (

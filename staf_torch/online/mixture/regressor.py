@@ -85,6 +85,8 @@ class Bank:
         compile: whether compiled code runs where there is a compiler; else the definition.
     """
 
+    moves = True
+
     def __init__(
         self,
         shape: BankShape,
@@ -130,6 +132,10 @@ class Bank:
             self.definition.clear(stream)
         self.table[rows] = part
         self._forget_answers()
+
+    def stretch(self, x: Tensor, y: Tensor, lapse: Tensor) -> bool:
+        """Return False: samples are learned one by one."""
+        return False
 
     def direct(self, shape: tuple[int, ...], targets: tuple[int, ...]) -> None:
         """No calls without a lock: they take a tenth of a millisecond."""

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from ..kalman_filter import rows_of
+from ..stream_state import rows_of
 
 LOCAL, CARRIED, QUADRATIC, TRACKERS = 24, 8, 8, 8
 MEMBERS = LOCAL + CARRIED + QUADRATIC + TRACKERS + 2  # ... and the linear model, the last value

@@ -1,0 +1,135 @@
+"""The filter of streams as a row program, a stream a row: what runs on a device, and has gradients."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ..lanes import Program, Shared
+from ..lanes.tree import Tree
+from .kalman_filter import LocalFilter
+from .local_functions import LocalFunctions
+from .own_functions import OwnFunctions
+from .stream_state import Counts, StateParts, StreamState
+
+_DIMS = 3, 1, 3, 3  # of the tensors of `OwnFunctions`, streams among them
+
+
+def law_of(filter_: LocalFilter) -> tuple[Tensor | float, ...]:
+    """Return the numbers of a filter beside its functions, in the order of the program."""
+    return filter_.ratio, filter_.forgetting, filter_.slack, filter_.robust, filter_.base
+
+
+def step(carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
+    """Expect a sample, and learn it: streams are the first dimension, but of what all have alike."""
+    functions, law = row
+    return after(_functions(functions), carry, now, law)
+
+
+def after(functions: LocalFunctions | OwnFunctions, carry: Tree, now: Tree, law: Tree) -> tuple[Tree, Tree]:
+    """The state after a sample of every stream, and mean and deviation (S, K) expected before.
+
+    Args:
+        functions: the local functions.
+        carry: parts of the state (S, ...), of D its lower triangle, in the dtype of the streams; counts.
+        now: x (S, n), y (S, K) and lapse (S,).
+        law: as `law_of`.
+    """
+    (parts, counts), (x, y, lapse) = carry, now
+    filter_, real, old = LocalFilter(functions, *law), parts[0].dtype, _state(parts)
+    # what counts values has no derivative
+    still = {name: getattr(old, name).detach() for name in ("surprises", "told", "leaps")}
+    old, x, y = old._replace(**still), x.mT, y.mT
+    expected = filter_.expected(old, x, filter_.forgetting**lapse)
+    new, seen = filter_.learned(old, Counts(*counts), x, y, lapse, torch.finfo(real))
+    count = old.mean.shape[1]
+    lower = [count * i + j for i, j in _entries(count) if j <= i]
+    kept = new._replace(learned=new.learned.flatten(0, 1)[lower])
+    found = tuple(part.movedim(-1, 0).to(real) for part in kept)
+    return (found, tuple(seen)), tuple(part.mT for part in expected)
+
+
+def _learned(carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
+    return step(carry, now, row)[0], ()
+
+
+def _expected(_: Tree, __: Tree, row: Tree) -> tuple[Tree, Tree]:
+    functions, law, parts, x = row
+    filter_ = LocalFilter(_functions(functions), *law)
+    mean, deviation = filter_.expected(_state(parts), x.mT, filter_.forgetting)
+    return (), (mean.mT.to(x.dtype), deviation.mT.to(x.dtype))
+
+
+def _functions(functions: Tree) -> OwnFunctions:
+    """With streams last; those of all streams alike have one."""
+    own = zip(functions, _DIMS, strict=True)
+    return OwnFunctions(*(part.movedim(0, -1) if part.dim() == d else part.unsqueeze(-1) for part, d in own))
+
+
+def _state(parts: Tree) -> StateParts:
+    """The state in float64, D whole: streams are the last dimension."""
+    old = StateParts(*(part.double().movedim(0, -1) for part in parts))
+    count = old.mean.shape[1]
+    places = [max(i, j) * (max(i, j) + 1) // 2 + min(i, j) for i, j in _entries(count)]
+    return old._replace(learned=old.learned[places].unflatten(0, (count, count)))
+
+
+def _entries(count: int) -> list[tuple[int, int]]:
+    return [(i, j) for i in range(count) for j in range(count)]
+
+
+FORECAST = Program(step, name="StaFRegressor over a stretch")
+"""Expects every sample, and learns it."""
+_LEARN = Program(_learned, name="StaFRegressor.fit")
+_EXPECT = Program(_expected, name="StaFRegressor.predict")
+
+
+class KernelFilter:
+    """`LocalFilter.predict` and `learn` as kernels of a device, a stream a thread.
+
+    Args:
+        definition: the filter; a kernel with a constant diagonal and exponent rate.
+        state: of the streams.
+    """
+
+    def __init__(self, definition: LocalFilter, state: StreamState) -> None:
+        functions, where = definition.functions, state.blocks.device
+
+        def placed(value: Tensor | float) -> Tensor | Shared:
+            tensor = torch.as_tensor(value, dtype=torch.float64, device=where)
+            return tensor.expand(state.streams) if tensor.dim() else Shared(tensor)
+
+        self._functions: tuple[Tensor | Shared, ...]
+        if isinstance(functions, OwnFunctions):
+            self._functions = tuple(part.movedim(-1, 0).to(where) for part in functions)
+        else:
+            assert functions.rate is not None
+            alike = OwnFunctions.of(functions.rate.double().reshape(1), functions.offsets.unsqueeze(0))
+            self._functions = tuple(Shared(part[..., 0].to(where)) for part in alike)
+        self._law = tuple(map(placed, law_of(definition)))
+        self._lapse = torch.ones(state.streams, dtype=torch.float64, device=where)
+
+    def predict(self, state: StreamState, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation of the next y at x (S, n), of the table's dtype: (S, K)."""
+        row = self._functions, self._law, self._parts(state), x
+        mean, deviation = _EXPECT((), (), row, steps=1)[1]
+        return mean[:, 0], deviation[:, 0]
+
+    def learn(self, state: StreamState, x: Tensor, y: Tensor, lapse: Tensor | None = None) -> None:
+        """Learn one sample a stream: (S, n), (S, K), in the table's dtype; (S,) float64."""
+        time = self._lapse if lapse is None else lapse
+        self.stretch(state, x.unsqueeze(0), y.unsqueeze(0), time.unsqueeze(0))
+
+    def stretch(self, state: StreamState, x: Tensor, y: Tensor, lapse: Tensor) -> None:
+        """Learn the samples of a stretch in one call: (T, S, n), (T, S, K), (T, S)."""
+        now = tuple(part.transpose(0, 1) for part in (x, y, lapse))
+        carry = self._parts(state), tuple(state.counts.unbind())
+        (parts, counts), _ = _LEARN(carry, now, (self._functions, self._law))
+        state.put(*(part.movedim(0, -1).flatten(0, -2) for part in parts))
+        state.counts.copy_(torch.stack(counts))
+
+    def _parts(self, state: StreamState) -> tuple[Tensor, ...]:
+        """The rows of the table as the program has them: (S, ...)."""
+        pieces = state.table.split(state.heights)
+        shaped = [part.unflatten(0, (-1, state.count)) if k == 2 else part for k, part in enumerate(pieces)]
+        return tuple(part.movedim(-1, 0) for part in shaped)
