@@ -232,10 +232,10 @@ def random_points(rows: int, dtype: torch.dtype) -> Case:
     learner, plant, cost, x0 = learning(rows, dtype)
 
     def call(x0: Tensor) -> Any:
-        found = adp.simulate(learner, plant, cost, x0, dt=1e-3, steps=100, every=10)
+        found = adp.simulate(learner, plant, cost, x0, dt=1e-3, steps=1000, every=100)
         return found.state, found.cost
 
-    return of_function(call, x0, times=100)
+    return of_function(call, x0, times=1000)
 
 
 def lorenz_gradients(rows: int, dtype: torch.dtype) -> Case:

@@ -103,8 +103,10 @@ class ActorCritic(Controller):
         one = torch.eye(self.basis.count, dtype=x0.dtype, device=x0.device)
         gain = self.gain.to(x0)[..., None, None] * one
         critic, actor, gain = self.law.init(self.critic.to(x0), self.actor.to(x0), gain)
-        wide = gain.expand(len(x0), -1, -1)
-        return Weights(critic.expand(rows).clone(), actor.expand(rows).clone(), wide.clone())
+        wide = Weights(critic.expand(rows), actor.expand(rows), gain.expand(len(x0), -1, -1))
+        return (
+            Weights(*map(Tensor.clone, wide)) if x0.is_cpu else wide
+        )  # a kernel reads them by their strides
 
     def recorded(self, carried: Weights) -> dict[str, Tensor]:
         return {"actor_weights": carried.actor, "critic_weights": carried.critic}

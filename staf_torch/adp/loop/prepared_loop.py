@@ -31,6 +31,7 @@ from ..problem.held_plant import RESOLVED, Holding, Substeps, fewest_and_most
 from ..problem.rules import warn_if_restless, warn_if_unstable
 from ..problem.shapes import check_problem
 from .controller import Controller, Feedback
+from .drawing import by_generator
 from .step import ClosedLoop, program
 
 _ROWS = 16  # with numbers of their own, that are looked at
@@ -47,6 +48,28 @@ class LoopSettings(NamedTuple):
     limit: float
 
 
+class LoopTraits(NamedTuple):
+    """What the parts of a loop say of its steps.
+
+    Attributes:
+        work: of a step of the controller, in steps of a feedback law.
+        costly: whether a program of a step takes a compiler very long.
+        generated: whether random numbers come from a generator a row.
+    """
+
+    work: float
+    costly: bool
+    generated: bool
+
+    @classmethod
+    def of(cls, loop: ClosedLoop) -> LoopTraits:
+        """Return those of a loop."""
+        parts = list(loop.controller.modules())
+        work = max(getattr(part, "work", 1.0) for part in parts)
+        costly = any(getattr(part, "costly", False) for part in parts)
+        return cls(work, costly, by_generator(loop.controller))
+
+
 @dataclasses.dataclass(frozen=True)
 class PreparedLoop:
     """A loop that has been checked.
@@ -55,11 +78,13 @@ class PreparedLoop:
         loop: one step.
         settings: of it.
         silent: whether the checks had nothing to say.
+        traits: of its parts.
     """
 
     loop: ClosedLoop
     settings: LoopSettings
     silent: bool
+    traits: LoopTraits
     _compiled: list[Program] = dataclasses.field(default_factory=list)
 
     def program(self, compile: bool) -> Program:
@@ -174,7 +199,8 @@ def prepared(
     if isinstance(controller, Feedback) and x0.device.type != "cpu":
         controller.check(x0)
     error = loop.holding.error
-    return PreparedLoop(loop, settings, silent and (error is None or error <= TOLERANCE))
+    silent = silent and (error is None or error <= TOLERANCE)
+    return PreparedLoop(loop, settings, silent, LoopTraits.of(loop))
 
 
 def _forget(kept: dict[Hashable, Any]) -> None:

@@ -31,9 +31,9 @@ from ..problem.held_plant import Substeps
 from ..problem.shapes import check_objects
 from .accuracy import hardest, needed, warn_of_errors, warn_of_models
 from .controller import Controller, Feedback, Policy
-from .drawing import by_generator, generated
+from .drawing import generated
 from .picture import LoopAbout
-from .prepared_loop import LoopSettings, PreparedLoop, key_of, known, prepared, remember
+from .prepared_loop import LoopSettings, LoopTraits, PreparedLoop, key_of, known, prepared, remember
 from .result import OF_ROWS, LoopResult
 from .step import ClosedLoop, LoopState, program, record
 
@@ -182,7 +182,7 @@ class _LoopRun:
         """
         loop, settings = ready.loop, ready.settings
         with torch.set_grad_enabled(learned):
-            result, last = self.of(loop, ready.program)
+            result, last = self.of(loop, ready.traits, ready.program)
         with torch.no_grad():
             seen = result.state[:, :: max(1, result.state.shape[1] // _SEEN)]
             reach = beside_history(wrap(seen, loop.system.periodic).abs().amax(-1).amax(-1), last.bent)
@@ -196,18 +196,17 @@ class _LoopRun:
         return result
 
     def of(
-        self, loop: ClosedLoop, make: Callable[[bool], Program] | None = None
+        self, loop: ClosedLoop, traits: LoopTraits, make: Callable[[bool], Program] | None = None
     ) -> tuple[LoopResult, LoopState]:
         """Return the result of a loop and its last state.
 
         Args:
             loop: one step.
+            traits: of its parts.
             make: its program, compiled or not; None for `program`.
         """
-        parts = list(loop.controller.modules())
-        work = self.steps * (loop.holding.steps + max(getattr(part, "work", 1.0) for part in parts) - 1)
+        costly, work = traits.costly, self.steps * (loop.holding.steps + traits.work - 1)
         often = DIFFERENTIATED if torch.is_grad_enabled() else 1  # as `simulate` found out
-        costly = any(getattr(part, "costly", False) for part in parts)
         pays = not costly and often * work * (1 + len(self.x0) / 200) >= _PAYS
         chosen = worth(pays, None if costly else self.x0) if self.compile == "auto" else bool(self.compile)
         compiled = chosen and loop.system.traceable
@@ -216,7 +215,7 @@ class _LoopRun:
         counted = self.progress is None and ran is found  # a `LoopProgram` counts its steps itself
         with Sign("adp.simulate", self.steps if counted else 0) as sign:
             tell = self.progress or sign.advance
-            return _run(loop, ran, self.x0, self.steps, self.every, self.seeds, tell)
+            return _run(loop, ran, self, traits.generated, tell)
 
     def checked(self, loop: ClosedLoop, result: LoopResult, rows: Tensor, again: bool) -> LoopResult:
         """Return the result in which the rows of a mask (B,) that need more steps took them, if they may run
@@ -250,12 +249,12 @@ class _LoopRun:
         some = dataclasses.replace(whole, x0=self.x0[rows], seeds=[self.seeds[row] for row in rows.tolist()])
         try:
             with some_rows(rows):
-                other, _ = some.of(loop)
+                other, _ = some.of(loop, LoopTraits.of(loop))
             alone = len(other.state) == len(rows)
         except (RuntimeError, ValueError):
             alone = False
         if not alone:  # the controller has first weights of all rows
-            other, _ = whole.of(loop)
+            other, _ = whole.of(loop, LoopTraits.of(loop))
         kept, structure = flatten([getattr(result, name) for name in OF_ROWS])
         new = flatten([getattr(other, name) for name in OF_ROWS])[0]
         pairs = zip(kept, new, strict=True)
@@ -266,16 +265,16 @@ class _LoopRun:
 def _run(
     loop: ClosedLoop,
     steps_of: Program | LoopProgram,
-    x0: Tensor,
-    steps: int,
-    every: int,
-    seeds: Sequence[int],
+    asked: _LoopRun,
+    old: bool,
     progress: Callable[[int], None],
 ) -> tuple[LoopResult, LoopState]:
+    """Return the result and the last state; ``old`` says that random numbers come from a generator a row."""
+    x0, steps, every, seeds = asked.x0, asked.steps, asked.every, asked.seeds
     state: LoopState = over_rows(loop.init, x0)
     pieces: list[list[Tensor]] = []
     draws, done = loop.controller.draws, 0
-    old = bool(draws) and by_generator(loop.controller)
+    old = bool(draws) and old
     row = {"seed": seed_parts(seeds, x0)} if draws and not old else {}
     generators = [torch.Generator().manual_seed(seed) for seed in (seeds if old else ())]
     draws = draws if old else 0  # ahead of the loop; others are drawn in it
