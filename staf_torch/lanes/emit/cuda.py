@@ -17,6 +17,7 @@ import torch
 from ..trace.graph import FLAG, NARROW, REAL, ROW, STEP, WHOLE, WIDE, Graph
 from ..trace.tracer import LARGE, NotLoweredError
 from .c import Names, ScalarWriter, random_numbers
+from .rooms import in_rooms
 from .schedule import Schedule, Sizes
 from .tables import TableWriter, Text
 
@@ -39,6 +40,7 @@ _LOOP = re.compile(r"for \(int ([pq]\w*) = \d+; [pq]\w* < (\d+);")
 _UNROLLED = 16  # passes over an array that a compiler may write out
 _WHOLE = 36  # entries that it is to write out, so that they may be in registers
 _KNOWN = 256  # numbers of an array that it knows, where a pass that is written out has one of them
+_PARTS = {"i0_2": 4, "u2 =": 2}  # passes over parts of a matrix that are written out
 FEWER_REGISTERS = "-DFEWER_REGISTERS"
 """An option for a compiler that has too few registers: sums of products are not written out all at once."""
 _PRELUDE = """#ifndef NAN
@@ -94,6 +96,8 @@ def emit_cuda(
 
 
 class _CudaWriter(ScalarWriter, TableWriter):
+    _side = 5
+
     def __init__(self, graph: Graph, schedule: Schedule, layout: Sizes, names: Names, dtypes: Dtypes) -> None:
         super().__init__(graph, schedule, layout, names)
         self._all, self._dtypes = names, dtypes
@@ -101,7 +105,7 @@ class _CudaWriter(ScalarWriter, TableWriter):
         self._held = 0  # bytes of them
 
     def write(self, following: Sequence[int], outputs: Sequence[int]) -> Text:
-        body = self._function(lambda: self._body(following, outputs))
+        body = in_rooms(self._function(lambda: self._body(following, outputs)), LARGE)
         source = [_PRELUDE + "\n".join(self._arguments()), *self._constants]
         source += random_numbers(body, self.real, "__device__ inline")
         source += [f'extern "C" __global__ void {KERNEL}(const __grid_constant__ Call call)', *body]
@@ -136,8 +140,11 @@ class _CudaWriter(ScalarWriter, TableWriter):
             super()._line("#pragma unroll PANELS" if "p +=" in text else "#pragma unroll")
         elif loop and int(loop[2]) > _UNROLLED:
             super()._line("#pragma unroll 4")
-        elif loop is None and text.startswith("for (int i0_"):  # over as much of a matrix as is left
-            super()._line("#pragma unroll 4" if text.startswith("for (int i0_2") else "#pragma unroll 1")
+        elif loop and loop[1][1:]:  # over a dimension of an array
+            some = max(n for n in range(1, 6) if int(loop[2]) % n == 0) if loop[1] != "p0" else 1
+            super()._line(f"#pragma unroll {some}")
+        elif loop is None and text.startswith(("for (int i0_", "for (int u")):  # over parts of a matrix
+            super()._line(f"#pragma unroll {_PARTS.get(text[9:13], 1)}")
         super()._line(text)
 
     def _constant_array(self, name: str, kind: str, values: Iterable[str]) -> None:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
+from collections.abc import Sequence
 
+from .products import ProductWriter
 from .schedule import evenly, leaves
-from .statements import StatementWriter
 
 _ARRAYS = {"a": "", "h": "_1", "v": "_2", "w": "_3"}
 """What of the operation is in arrays: its result, the triangle, the vector of a reflection and its image."""
 
 
-class MatrixWriter(StatementWriter):
+class MatrixWriter(ProductWriter):
     """Writes, besides numbers and arrays, Householder's tridiagonal form of a symmetric matrix."""
 
     def _tridiagonal(self, node: int) -> None:
@@ -66,13 +66,15 @@ class MatrixWriter(StatementWriter):
                 h = self._part("h", node, "i0_0", j)
                 self._line(f"{h} = {h} / t{node}_1{self._copy(j)};")
 
-    def _entry_of_each(self, node: int, sizes: list[int]) -> list[str]:
-        """Return where entry (i0_0, i0_1) of a matrix is in each of what is read."""
+    def _entry_of_each(self, node: int, sizes: list[int], at: Sequence[str] = ("i0_0", "i0_1")) -> list[str]:
+        """Return where an entry of a matrix is in each of what is read."""
         found = []
         for _, places in leaves(self.graph, self._taken_over, node):
             index = evenly(places, sizes)
-            regular = None if index is None else self._sum(["i0_0", "i0_1"], *index)
-            found.append(self._lookup(places, f"i0_0 * {sizes[1]} + i0_1") if regular is None else regular)
+            regular = None if index is None else self._sum(at, *index)
+            found.append(
+                self._lookup(places, f"{at[0]} * {sizes[1]} + {at[1]}") if regular is None else regular
+            )
         return found
 
     def _reflector(self, node: int, size: int) -> None:
@@ -147,9 +149,6 @@ class MatrixWriter(StatementWriter):
         for j in range(self.copies):
             stated = self._stated(value, self.graph.type[node])
             self._line(f"{self._type(node)} t{node}_{name}{self._copy(j)} = {stated};")
-
-    def _over(self, name: str, begin: str, end: str | int) -> AbstractContextManager[None]:
-        return self._braces(f"for (int {name} = {begin}; {name} < {end}; ++{name})")
 
     def _part(self, name: str, node: int, at: str, j: int) -> str:
         """An entry of an array of the node's own."""

@@ -269,21 +269,18 @@ class StatementWriter(abc.ABC):
         """Write the entries of a map into an array."""
         sizes = [s for s in self.graph.aux[node][1] if s > 1]
         places = [each for _, each in leaves(self.graph, self._taken_over, node)]
-        indices = [evenly(each, sizes) for each in places]
         names = [f"p{d}" for d in range(len(sizes))]
-        whole = all(index is not None for index in indices)
-        if not whole:
-            names, sizes = ["p"], [math.prod(sizes)]
-        target = self._sum(names, [math.prod(sizes[d + 1 :]) for d in range(len(sizes))], 0)
+        strides = [math.prod(sizes[d + 1 :]) for d in range(len(sizes))]
+        target = self._sum(names, strides, 0)
         with contextlib.ExitStack() as loops:
             for variable, size in zip(names, sizes, strict=True):
                 loops.enter_context(
                     self._braces(f"for (int {variable} = 0; {variable} < {size}; ++{variable})")
                 )
-            ats = [
-                self._sum(names, *index) if whole and index is not None else self._lookup(each)
-                for each, index in zip(places, indices, strict=True)
-            ]
+            ats = []
+            for each in places:
+                index = evenly(each, sizes)
+                ats.append(self._lookup(each, target) if index is None else self._sum(names, *index))
             for j in range(self.copies):
                 value = self._mapped(node, iter(ats), j)
                 self._line(f"{name}[({target}) * {self.copies} + {j}] = {value};")
@@ -299,45 +296,6 @@ class StatementWriter(abc.ABC):
             at = next(ats)
             values.append(self._ref(operand, j) if place is None else self._read(operand, at, j))
         return self._operation(op, values, self.graph.type[node])
-
-    def _dot(self, node: int) -> None:
-        """Sums of products, some rows of them in registers at once."""
-        outs, count, *places = self.graph.aux[node]
-        kind = self._type(node)
-        rounded = self._narrowed if self.graph.type[node] == NARROW else str
-        self._declare(node)
-        indices = [evenly(place, [outs, count]) for place in places]
-        widths = range(4, 1 + (6 if self.copies > 1 else 8))
-        panel = min(outs, min(reversed(widths), key=lambda width: -(-outs // width) * width))
-        full = outs // panel
-        for start, rows, passes in ((0, panel, full), (full * panel, outs % panel, 1)):
-            if rows == 0 or passes == 0:
-                continue
-            with self._braces(f"for (int p = {start}; p < {start + rows * passes}; p += {rows})"):
-                for r in range(rows):
-                    for j in range(self.copies):
-                        first = self._product(node, indices, places, r, "0", j)[2]
-                        self._line(f"{kind} r{r}{self._copy(j)} = {rounded(first)};")
-                with self._braces(f"for (int q = 1; q < {count}; ++q)"):
-                    for r in range(rows):
-                        for j in range(self.copies):
-                            a, b, _ = self._product(node, indices, places, r, "q", j)
-                            name = f"r{r}{self._copy(j)}"
-                            self._line(f"{name} = {rounded(self._fma(a, b, name))};")
-                for r in range(rows):
-                    for j in range(self.copies):
-                        self._line(f"a{node}[(p + {r}) * {self.copies} + {j}] = r{r}{self._copy(j)};")
-
-    def _product(self, node: int, indices: Any, places: Any, r: int, q: str, j: int) -> tuple[str, str, str]:
-        count, values = self.graph.aux[node][1], []
-        for operand, place, index in zip(self.graph.args[node], places, indices, strict=True):
-            if place is None:
-                values.append(self._ref(operand, j))
-            elif index is not None:
-                values.append(self._read(operand, self._sum([f"(p + {r})", q], *index), j))
-            else:
-                values.append(self._read(operand, self._lookup(place, f"(p + {r}) * {count} + {q}"), j))
-        return values[0], values[1], f"{values[0]} * {values[1]}"
 
     def _declare(self, node: int) -> None:
         self._line(f"{self._type(node)} a{node}[{self.graph.size(node) * self.copies}];")
