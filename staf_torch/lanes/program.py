@@ -16,7 +16,7 @@ from .compiler import machine_code
 from .contents import Contents, Derived
 from .emit.c import Names, c_text
 from .emit.cpp import emit
-from .given import Given
+from .given import Given, whole
 from .locks import Mutex
 from .log import say
 from .loops import scan, tracing_now
@@ -145,6 +145,8 @@ class Program(Derived):
         """
         if tracing_now() and every == 1 and _loops_over(now):  # within a program that is traced
             return scan(lambda carry, now: self.step(carry, now, row), carry, now)
+        if not self.compile:  # nothing to prepare or to watch
+            return self.definition(carry, now, row, steps=steps, every=whole("every", every, 1))
         self._look_around()
         leaves, structure = flatten((row, now, carry))
         known = self._prepared  # of this step: another dictionary takes its place where that changes

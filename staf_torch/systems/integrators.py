@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import logging
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
@@ -135,7 +135,9 @@ def _stepped(
         return step
 
     def untracked(now: Tracked, given: Tree, row: Tree) -> tuple[Tracked, Tensor]:
-        return (_advanced(system, now[0], dt, count)[0], *now[1:]), now[0]
+        x = now[0]
+        after = _advanced(system, x, dt, count)[0] if count > 1 else _runge_kutta(system, x, dt)[0]
+        return (after, *now[1:]), x
 
     def compiled() -> Program:
         parts = system, dt, count
@@ -155,8 +157,8 @@ def _advanced(system: ControlAffineSystem, x: Tensor, dt: float, count: int) -> 
     h = dt / count
 
     def advanced(x: Tensor) -> tuple[Tensor, Tensor]:
-        _, slopes = runge_kutta_stages(lambda at, share: _drift(system, at), x, h)
-        return x + runge_kutta_mean(slopes, h), h * (slopes[2] - slopes[1]).abs().amax(-1)
+        after, slopes = _runge_kutta(system, x, h)
+        return after, h * (slopes[2] - slopes[1]).abs().amax(-1)
 
     def substep(now: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
         after, bent = advanced(now[0])
@@ -166,6 +168,12 @@ def _advanced(system: ControlAffineSystem, x: Tensor, dt: float, count: int) -> 
         return advanced(x)
     found: tuple[Tensor, Tensor] = repeat(count, substep, (x, torch.zeros_like(x[..., 0])))
     return found
+
+
+def _runge_kutta(system: ControlAffineSystem, x: Tensor, h: float) -> tuple[Tensor, Sequence[Tensor]]:
+    """x after a step of h, and the rates at its four stages."""
+    _, slopes = runge_kutta_stages(lambda at, share: _drift(system, at), x, h)
+    return x + runge_kutta_mean(slopes, h), slopes
 
 
 def _advanced_rows(
