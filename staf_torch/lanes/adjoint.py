@@ -7,7 +7,6 @@ memory is slower than arithmetic, the backward pass computes it again (`backward
 from __future__ import annotations
 
 import contextlib
-import logging
 import re
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -20,9 +19,10 @@ from .backward import Backward, empty_rows, split
 from .call import Compiled, PlannedCall
 from .device.kernel import DeviceCall
 from .given import Given
+from .growth import Slope, grown, say_grown
 from .log import say
 from .row_numbers import RowNumbers, columns
-from .tree import Shared, flatten, plain, unflatten
+from .tree import Shared, flatten, labels, plain, unflatten
 
 if TYPE_CHECKING:
     from .program import Program
@@ -33,9 +33,6 @@ _WORTH = 10  # operations of a step for each byte of its carry: kept, it costs l
 Plan = PlannedCall | DeviceCall
 _PLANS = 64  # calls of other shapes that are remembered
 _MEBIBYTE = 2**20
-_GROWN = 1e12  # times what a gradient is of, from which on it is reported
-_grown: set[str] = set()  # programs of which that was said
-_log = logging.getLogger(__name__)
 _budget = 256 * _MEBIBYTE
 
 
@@ -287,10 +284,30 @@ class GradientCall:
             return self._by_definition(ran, tensors, needs, ends, again=True)
         adjoint = Backward(ran, [tensor.detach() for tensor in tensors], needs, ends)
         if adjoint.built is not None:
-            return adjoint.run(kept)
-        self._refused = True
-        with torch.enable_grad():
-            return self._by_definition(ran, tensors, needs, ends, again=False)
+            found = adjoint.run(kept)
+        else:
+            self._refused = True
+            with torch.enable_grad():
+                found = self._by_definition(ran, tensors, needs, ends, again=False)
+        some, made = ([part for part in parts if part is not None] for parts in (ends, found))
+        pairs = zip(self._shared, found, strict=False)
+        by_row = any(part is not None and not shared for shared, part in pairs)
+        carried = [] if by_row else adjoint.slopes  # what is summed over rows names none of them
+        if grown(self.program.name, some, [*made, *(x for _, x in carried)]):
+            say_grown(self.program.name, some, self._named(ran, found, carried))
+        return found
+
+    def _named(
+        self, ran: Ran, found: Sequence[Tensor | None], carried: Sequence[tuple[int, Tensor]]
+    ) -> list[Slope]:
+        """Return gradients, and those by leaves of the carry beside them, with what they are by."""
+        names = [x for tree in ("row", "now", "carry") for x in labels(self.structures[tree], tree)]
+        captured = [f"a tensor of the shape {tuple(tensor.shape)} that it reads" for tensor in ran.captured]
+        kinds = [(name, not shared) for name, shared in zip(names, self._shared, strict=True)]
+        kinds += [*((name, False) for name in captured), *[("numbers of rows", True)] * len(ran.numbers)]
+        slopes = [Slope(name, x, of) for (name, of), x in zip(kinds, found, strict=True) if x is not None]
+        first = self.sizes[0] + self.sizes[1]
+        return [*slopes, *(Slope(names[first + k], x, by_row=True) for k, x in carried)]
 
     def _by_definition(
         self,
@@ -339,33 +356,7 @@ class _Gradient(torch.autograd.Function):
         if all(end is None for end in ends):
             return (None,) * (1 + len(needs))
         count = len(needs)
-        found = ctx.ran.call.backward(ctx.ran, saved[:count], saved[count:], needs, ends)
-        _warn_where_grown(ctx.ran.call.program.name, ends, found)
-        return None, *found
-
-
-def _warn_where_grown(name: str, ends: Sequence[Tensor | None], found: Sequence[Tensor | None]) -> None:
-    """Log, once a program, gradients in which rounding has grown over the times until nothing else is left.
-
-    On a device, and in `torch.func`, nobody looks: a number would have to be waited for.
-    """
-    gradients = [part.detach() for part in found if part is not None and part.numel()]
-    given = [end.detach() for end in ends if end is not None]
-    wrapped = torch._C._functorch.is_functorch_wrapped_tensor
-    if name in _grown or any(
-        part.is_meta or not part.is_cpu or wrapped(part) for part in (*gradients, *given)
-    ):
-        return
-    came = sum(float(torch.linalg.vector_norm(end, 1)) for end in given)
-    most = max((float(torch.linalg.vector_norm(part, torch.inf)) for part in gradients), default=0.0)
-    if came > 0 and most > _GROWN * came:
-        _grown.add(name)
-        told = (
-            "%s: a gradient of %.1e, %.1e times what it is the gradient of, is made of rounding: the "
-            "recursion amplifies small changes from time to time. Take a law that comes nearer in a step, "
-            "more inner steps, or fewer times (`detach` between them). Said once."
-        )
-        _log.warning(told, name, most, most / came)
+        return None, *ctx.ran.call.backward(ctx.ran, saved[:count], saved[count:], needs, ends)
 
 
 def carried(compiled: Compiled) -> int:

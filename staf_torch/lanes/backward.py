@@ -43,6 +43,7 @@ class Backward:
 
     Attributes:
         built: of the adjoint; None where there is none.
+        slopes: by the carry before the first time, with the places of its leaves; none before `run`.
     """
 
     def __init__(
@@ -50,6 +51,7 @@ class Backward:
     ) -> None:
         call = ran.call
         self._ran, self._call = ran, call
+        self.slopes: list[tuple[int, Tensor]] = []
         sizes = (*call.sizes, len(ran.captured), len(ran.numbers))
         given = call.given(tensors[: sum(call.sizes)])
         self._row, self._now, self._carry = given.row, given.now, given.carry
@@ -169,8 +171,11 @@ class Backward:
             slopes.append(after)
             pairs = zip(total, self._summed, strict=True)
             sums.append([_units(x) if shared else x for x, (_, shared) in pairs])
+        carried = [_joined(parts) for parts in zip(*slopes, strict=True)]
+        places = [k for k, decides in enumerate(self._form.carry) if decides]
+        self.slopes = [*zip(places, carried, strict=True)]
         return self._sorted(
-            [_joined(parts) for parts in zip(*slopes, strict=True)],
+            carried,
             [_joined(parts) for parts in zip(*sums, strict=True)],
             at_times.joined(),
         )
