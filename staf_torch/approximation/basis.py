@@ -273,6 +273,8 @@ class StaFBasis(nn.Module, metaclass=Rowwise):
 
         F itself is infinite where V is not in the kernel's space; its excess never is.
         """
+        trailing("StaFBasis.excess", "weights", weights, dims=1, last=self.count)
+        beside_batch("StaFBasis.excess", "weights", weights, 1, x.shape[:-1], "x is")
         difference = weights - self.ideal_weights(x, target)
         product = (self.gram(x) @ difference.unsqueeze(-1)).squeeze(-1)
         excess: Tensor = torch.linalg.vecdot(difference, product)

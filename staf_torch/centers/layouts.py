@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 import warnings
@@ -158,7 +159,7 @@ def ball(count: int, dim: int) -> Tensor:
 
     Unisolvent for polynomials of degree <= k whenever count = C(dim + k, k). Deterministic: the points
     are chosen among a fixed low-discrepancy cloud by row pivoting of a polynomial Vandermonde matrix,
-    then exchanged one by one as long as that increases its determinant.
+    then exchanged one by one as long as that increases its determinant. A process chooses them once.
 
     Example:
         >>> directions = ball(10, dim=3)
@@ -184,17 +185,7 @@ def ball(count: int, dim: int) -> Tensor:
     integer("ball", "dim", dim, least=1)
     if count == 1:
         return torch.zeros(1, dim, dtype=torch.float64, device="cpu")
-    degree = 0
-    while math.comb(dim + degree, degree) < count:
-        degree += 1
-    cloud = _cloud(max(_CANDIDATES, 20 * count), dim)
-    vandermonde = monomials(cloud, degree)
-    for _ in range(2):  # orthonormal over the cloud; twice, so that rounding does not show
-        vandermonde = torch.linalg.qr(vandermonde)[0]
-    chosen = _pivot_rows(vandermonde, count)
-    if count == vandermonde.shape[1]:
-        chosen = _exchange(vandermonde, chosen)
-    return cloud[chosen]
+    return _fekete(count, dim).clone()
 
 
 def probe_points(count: int, dim: int) -> Tensor:
@@ -241,6 +232,22 @@ def monomials(points: Tensor, degree: int) -> Tensor:
     for axis in range(1, points.shape[-1]):
         result = result * powers[..., axis, rows[:, axis]]
     return result
+
+
+@functools.lru_cache(maxsize=128)
+def _fekete(count: int, dim: int) -> Tensor:
+    """The points of `ball`, whose choice takes up to seconds, kept: nobody else writes to these."""
+    degree = 0
+    while math.comb(dim + degree, degree) < count:
+        degree += 1
+    cloud = _cloud(max(_CANDIDATES, 20 * count), dim)
+    vandermonde = monomials(cloud, degree)
+    for _ in range(2):  # orthonormal over the cloud; twice, so that rounding does not show
+        vandermonde = torch.linalg.qr(vandermonde)[0]
+    chosen = _pivot_rows(vandermonde, count)
+    if count == vandermonde.shape[1]:
+        chosen = _exchange(vandermonde, chosen)
+    return cloud[chosen]
 
 
 def _cloud(size: int, dim: int) -> Tensor:

@@ -25,6 +25,7 @@ from ..signs import Sign
 from .call import at_once, ordinary
 from .call import served as served_by
 from .contents import BOUND, Contents
+from .given import one_precision
 from .locks import Mutex
 from .loops import tracing_now
 from .one_thread import ENTRIES, alone
@@ -226,14 +227,14 @@ class CompiledMethod:
 
     def _defined(self, x: Tensor, *more: Tree) -> Any:
         """Compute by the definition, with new tensors beside x whatever the default device is."""
-        if RowNumbers.made and isinstance(x, Tensor):
-            return over_rows(
-                lambda at, *rest: self.definition(plain(at), *rest), Shared(x) if x.dim() < 2 else x, *more
-            )
-        if _device.CURRENT_DEVICE is None or not isinstance(x, Tensor):
-            return self.definition(x, *more)
-        with torch.device(x.device):
-            return self.definition(x, *more)
+        with one_precision(self._settings.name, x, *more):
+            if RowNumbers.made and isinstance(x, Tensor):
+                states = Shared(x) if x.dim() < 2 else x
+                return over_rows(lambda at, *rest: self.definition(plain(at), *rest), states, *more)
+            if _device.CURRENT_DEVICE is None or not isinstance(x, Tensor):
+                return self.definition(x, *more)
+            with torch.device(x.device):
+                return self.definition(x, *more)
 
     def _refused(self, x: Tensor, *more: Tree) -> Any:
         """Raise what the definition says of x, or that no state is an integer, a flag or a single number."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Hashable, Sequence
 from typing import Any, NamedTuple
 
@@ -10,6 +11,34 @@ from torch import Tensor
 
 from .call import Where, ordinary
 from .tree import Shared, Tree, flatten, labels, plain, unflatten
+
+
+class one_precision:  # noqa: N801
+    """Context of a function that may read a network or tensor of another precision than its inputs.
+
+    Args:
+        name: of what was called, for the error.
+        inputs: trees of tensors.
+
+    Raises:
+        ValueError: in place of torch's error on two dtypes.
+    """
+
+    def __init__(self, name: str, *inputs: Tree) -> None:
+        self._name, self._inputs = name, inputs
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: Any, error: BaseException | None, _: object) -> None:
+        if kind is None or kind is not RuntimeError or not re.search("same dtype|scalar type", str(error)):
+            return
+        floats = [x.dtype for x in map(plain, flatten(self._inputs)[0]) if x.is_floating_point()]
+        real = floats[0] if floats else "of no precision"
+        raise ValueError(
+            f"{self._name}: its inputs are {real}, and a network or tensor that it reads is not: write "
+            f"`net.to({real})`, or `net(x.float())` for 7 digits; torch's error: {str(error).strip()}"
+        ) from error
 
 
 def whole(name: str, value: object, least: int) -> int:

@@ -16,7 +16,7 @@ from .compiler import machine_code
 from .contents import Contents, Derived
 from .emit.c import Names, c_text
 from .emit.cpp import emit
-from .given import Given, whole
+from .given import Given, one_precision, whole
 from .locks import Mutex
 from .log import say
 from .loops import scan, tracing_now
@@ -200,7 +200,8 @@ class Program(Derived):
         def all_times(carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
             return self._all_times(Given.of(carry, now, row, steps), carry, every)
 
-        return over_rows(all_times, carry, now, row)
+        with one_precision(self.name, carry, now, row):
+            return over_rows(all_times, carry, now, row)
 
     def _all_times(self, given: Given, carry: Tree, every: int) -> tuple[Tree, Tree]:
         fixed = given.tree("row", [plain(leaf) for leaf in given.row])
@@ -364,7 +365,8 @@ class Program(Derived):
             again, self._asked = not self._asked, rows
             self._of_users = Contents(self.step).of_users
             if self._of_users:
-                self._refused = self._refused or doubt(self.step, given, again=again)
+                with one_precision(self.name, *given.trees()):
+                    self._refused = self._refused or doubt(self.step, given, again=again)
             if self._refused is not None:
                 say(self.name, f"its step {self._refused}")
         return self._refused is None

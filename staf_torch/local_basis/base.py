@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ..kernels import Kernel
+from ..numerics.checks import beside_batch, trailing
 from ..numerics.linalg import row_jacobian
 
 _ROWS = 4096  # rows a block: the temporaries of one stay in the inner caches
@@ -45,6 +46,36 @@ class LocalSpace(Protocol):
 
     def coefficients(self, weights: Tensor) -> Tensor:
         """beta from the paper's w: (..., M) -> (..., M)."""
+
+
+def of_states(call: str, name: str, value: Tensor, state: Tensor, last: int, dims: int = 1) -> None:
+    """Refuse what is not beside the states of a space.
+
+    Args:
+        call: the method, for the message, and so is ``name`` its argument.
+        value: (..., last), of so many dimensions beside those of the states.
+        state: x, (..., n).
+        last: size of its last dimension.
+        dims: of it that belong to no batch.
+
+    Raises:
+        ValueError: that names both sizes.
+    """
+    shape = value.shape
+    if len(shape) < dims or shape[-1] != last:
+        trailing(f"StaFBasis.local(x).{call}", name, value, dims, last)
+    if shape[:-dims] != state.shape[:-1]:
+        beside_batch(f"StaFBasis.local(x).{call}", name, value, dims, state.shape[:-1], "x is")
+
+
+def at_points(call: str, z: Tensor, coefficients: Tensor, state: Tensor, count: int) -> None:
+    """Refuse points z (..., P, n) and coefficients (..., M) that are not beside the states (..., n)."""
+    of_states(call, "z", z, state, state.shape[-1], dims=2)
+    of_states(call, "coefficients", coefficients, state, count)
+    if z.shape[:-2] != coefficients.shape[:-1]:
+        beside_batch(
+            f"StaFBasis.local(x).{call}", "coefficients", coefficients, 1, z.shape[:-2], "z is for points of"
+        )
 
 
 def with_gradient(function: Callable[[Tensor], Tensor], z: Tensor) -> tuple[Tensor, Tensor]:

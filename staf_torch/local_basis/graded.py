@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from ..kernels import Kernel
-from .base import from_scaled, in_blocks, rows_last, scale, scaled_gradient, to_scaled
+from .base import at_points, from_scaled, in_blocks, of_states, rows_last, scale, scaled_gradient, to_scaled
 from .elimination import Degrees, degrees_of, functionals_of
 
 _NODES = 24
@@ -188,6 +188,7 @@ class GradedSpace(NamedTuple):
 
     def fit(self, values: Tensor) -> Tensor:
         """beta with sum_j psi_j(u_i) beta_j = e^{-s(d_i)} V(c_i): (..., M) -> (..., M)."""
+        of_states("fit", "values", values, self.state, self.directions.shape[-2])
         # Where the radius of a row is the same at all its states, its own inverse is exact and as cheap.
         bound = self.bound() if self.meeting and self.nu.dim() > 0 else None
         if bound is not None:
@@ -204,11 +205,13 @@ class GradedSpace(NamedTuple):
 
     def evaluate(self, z: Tensor, coefficients: Tensor) -> Tensor:
         """V^(x + z): (..., P, n), (..., M) -> (..., P)."""
+        at_points("evaluate", z, coefficients, self.state, self.directions.shape[-2])
         terms = self._terms(z, self._r2())
         return _sums(terms, self._ridge_weights(coefficients)) * scale(self.kernel, self.state, z)
 
     def evaluate_with_gradient(self, z: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor]:
         """V^(x + z) and its gradient in z, in closed form: (..., P, n), (..., M) -> (..., P), (..., P, n)."""
+        at_points("evaluate_with_gradient", z, coefficients, self.state, self.directions.shape[-2])
         r2, apart = self._r2(), self._ridge_weights(coefficients)
         terms = self._terms(z, r2)
         sums = _sums(terms, apart)
@@ -223,6 +226,7 @@ class GradedSpace(NamedTuple):
 
         Not finite where r^(-2 k_j) is not.
         """
+        of_states("scaled_weights", "coefficients", coefficients, self.state, self.directions.shape[-2])
         b = (coefficients * self._unscale()) @ self.basis.functionals.to(coefficients).mT
         return b * scale(self.kernel, self.state, self.offsets, -1.0)
 
@@ -232,6 +236,7 @@ class GradedSpace(NamedTuple):
 
     def coefficients(self, weights: Tensor) -> Tensor:
         """beta from the paper's w: (..., M) -> (..., M)."""
+        of_states("coefficients", "weights", weights, self.state, self.directions.shape[-2])
         b = to_scaled(self.kernel, self.state, weights) * scale(self.kernel, self.state, self.offsets)
         full = self.basis.functionals  # orthogonal columns
         inverse = full / full.square().sum(0)

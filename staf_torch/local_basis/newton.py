@@ -8,7 +8,16 @@ from torch import Tensor
 
 from ..kernels import Kernel
 from ..numerics.pivoted_cholesky import PivotedCholesky, pivoted_cholesky
-from .base import evaluate_scaled, from_scaled, scale, scaled_gradient, to_scaled, with_gradient
+from .base import (
+    at_points,
+    evaluate_scaled,
+    from_scaled,
+    of_states,
+    scale,
+    scaled_gradient,
+    to_scaled,
+    with_gradient,
+)
 
 
 class NewtonSpace(NamedTuple):
@@ -34,14 +43,17 @@ class NewtonSpace(NamedTuple):
 
     def fit(self, values: Tensor) -> Tensor:
         """beta = e^{-s} V(c): (..., M) -> (..., M)."""
+        of_states("fit", "values", values, self.state, self.offsets.shape[-2])
         return values * scale(self.kernel, self.state, self.offsets, -1.0)
 
     def evaluate(self, z: Tensor, coefficients: Tensor) -> Tensor:
         """V^(x + z): (..., P, n), (..., M) -> (..., P)."""
+        at_points("evaluate", z, coefficients, self.state, self.offsets.shape[-2])
         return evaluate_scaled(self.kernel, self.offsets, self.state, z, self._solve(coefficients))
 
     def evaluate_with_gradient(self, z: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor]:
         """V^(x + z) and its gradient in z: (..., P, n), (..., M) -> (..., P), (..., P, n)."""
+        at_points("evaluate_with_gradient", z, coefficients, self.state, self.offsets.shape[-2])
         b = self._solve(coefficients)
         slope = self.kernel.core_gradient(self.state, z, self.offsets, b)
         if slope is None:
@@ -51,6 +63,7 @@ class NewtonSpace(NamedTuple):
 
     def scaled_weights(self, coefficients: Tensor) -> Tensor:
         """e^g w: (..., M) -> (..., M)."""
+        of_states("scaled_weights", "coefficients", coefficients, self.state, self.offsets.shape[-2])
         return self._solve(coefficients) * scale(self.kernel, self.state, self.offsets, -1.0)
 
     def weights(self, coefficients: Tensor) -> Tensor:
@@ -59,6 +72,7 @@ class NewtonSpace(NamedTuple):
 
     def coefficients(self, weights: Tensor) -> Tensor:
         """beta from the paper's w: (..., M) -> (..., M)."""
+        of_states("coefficients", "weights", weights, self.state, self.offsets.shape[-2])
         scaled = to_scaled(self.kernel, self.state, weights)
         b = scaled * scale(self.kernel, self.state, self.offsets)
         core = self.kernel.core(self.state, self.offsets, self.offsets)

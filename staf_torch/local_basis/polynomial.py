@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from ..kernels import PolynomialKernel
+from .base import at_points, of_states
 from .elimination import Degrees, functionals_of
 
 
@@ -40,6 +41,7 @@ class PolynomialSpace(NamedTuple):
 
     def fit(self, values: Tensor) -> Tensor:
         """beta with sum_j psi_j(d_i) beta_j = V(c_i), one step of refinement: (..., M) -> (..., M)."""
+        of_states("fit", "values", values, self.state, self.offsets.shape[-2])
         scaled = values / self._a(self.offsets) ** self.kernel.degree
         ones = torch.ones_like(self.directions[..., 0])
         nodal = self._functions(self.directions, ones)
@@ -49,10 +51,12 @@ class PolynomialSpace(NamedTuple):
 
     def evaluate(self, z: Tensor, coefficients: Tensor) -> Tensor:
         """V^(x + z): (..., P, n), (..., M) -> (..., P)."""
+        at_points("evaluate", z, coefficients, self.state, self.offsets.shape[-2])
         return _apply(self._functions(self._zeta(z), self._a(z)), coefficients)
 
     def evaluate_with_gradient(self, z: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor]:
         """V^(x + z) and its gradient in z: (..., P, n), (..., M) -> (..., P), (..., P, n)."""
+        at_points("evaluate_with_gradient", z, coefficients, self.state, self.offsets.shape[-2])
         a, tau = self._a(z).unsqueeze(-1), self._zeta(z) @ self.directions.mT
         value, by_tau, by_a = torch.zeros_like(tau), torch.zeros_like(tau), torch.zeros_like(tau)
         p, r2 = self.kernel.degree, self.radius[..., None, None].square()
@@ -75,6 +79,7 @@ class PolynomialSpace(NamedTuple):
 
     def scaled_weights(self, coefficients: Tensor) -> Tensor:
         """The paper's w: (..., M) -> (..., M); this kernel has no gain."""
+        of_states("scaled_weights", "coefficients", coefficients, self.state, self.offsets.shape[-2])
         p = self.kernel.degree
         b = _apply(self.weights_, coefficients * self._unscale())
         s = _square(self.kernel, self.state).unsqueeze(-1)
@@ -87,6 +92,7 @@ class PolynomialSpace(NamedTuple):
 
     def coefficients(self, weights: Tensor) -> Tensor:
         """beta from the paper's w: (..., M) -> (..., M)."""
+        of_states("coefficients", "weights", weights, self.state, self.offsets.shape[-2])
         s = _square(self.kernel, self.state).unsqueeze(-1)
         b = weights * (s * self._a(self.offsets)) ** self.kernel.degree
         inverse = self.weights_ / self.weights_.square().sum(-2, keepdim=True)

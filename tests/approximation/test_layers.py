@@ -357,3 +357,15 @@ def test_points_of_another_batch_are_refused_with_both_numbers() -> None:
             call(y)
     with pytest.raises(ValueError, match=r"`StaFBasis\(y=...\)` is for 7 states, but x is for 5 states"):
         staf.basis(y, staf.state)
+    space = staf.basis.local(staf.state)
+    weights = uniform(7, staf.basis.count)
+    for name, refused in (
+        ("values", lambda: space.fit(weights)),
+        ("z", lambda: space.evaluate(y, weights[:5])),
+        ("coefficients", lambda: space.evaluate(y[:5], weights)),
+        ("z", lambda: space.evaluate_with_gradient(y, weights[:5])),
+        ("weights", lambda: space.coefficients(weights)),
+        ("weights", lambda: staf.basis.excess(weights, staf.state, Paper())),
+    ):
+        with pytest.raises(ValueError, match=rf"\({name}=...\)` is for 7 states, but x is for 5 states"):
+            refused()

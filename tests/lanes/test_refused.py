@@ -300,6 +300,25 @@ def test_a_carry_keeps_its_shapes_its_kinds_and_its_tree() -> None:
         Program(lambda c, n, r: (c.double(), ())).text(x, steps=1)
 
 
+@pytest.mark.parametrize("kind", [torch.float32, torch.float16])
+def test_a_network_of_another_precision_is_named_with_what_to_write(kind: torch.dtype) -> None:
+    net = torch.nn.Linear(2, 2, dtype=kind)
+
+    class Own(torch.nn.Module):
+        @lanes.compiled("one of mine")
+        def forward(self, x: Tensor) -> Tensor:
+            return net(x)  # type: ignore[no-any-return]
+
+    program = Program(lambda x, _, __: (net(x), ()), name="one of mine")
+    plain = Program(program.step, name="one of mine", compile=False)
+    calls = (lambda: program(X, steps=3), lambda: plain(X, steps=3), lambda: program.c_source("f", X))
+    for call in (*calls, lambda: Own()(X)):
+        with pytest.raises(
+            ValueError, match=r"^one of mine: its inputs are torch.float64, .* `net.to\(torch"
+        ):
+            call()
+
+
 def test_an_error_while_tracing_leaves_the_definition(caplog: pytest.LogCaptureFixture) -> None:
     class Odd:
         def __init__(self) -> None:
