@@ -311,7 +311,7 @@ def test_a_network_of_another_precision_is_named_with_what_to_write(kind: torch.
 
     program = Program(lambda x, _, __: (net(x), ()), name="one of mine")
     plain = Program(program.step, name="one of mine", compile=False)
-    calls = (lambda: program(X, steps=3), lambda: plain(X, steps=3), lambda: program.c_source("f", X))
+    calls = (lambda: program.c_source("f", X), lambda: program(X, steps=3), lambda: plain(X, steps=3))
     for call in (*calls, lambda: Own()(X)):
         with pytest.raises(
             ValueError, match=r"^one of mine: its inputs are torch.float64, .* `net.to\(torch"
