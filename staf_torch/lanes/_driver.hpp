@@ -107,8 +107,10 @@ INLINE void gather_times(const Slot *slot, REAL *const *data, int slots, const F
             REAL *const column = to + int64_t(e) * f.span;
             for (int r = 0; r < lanes; ++r) column[f.times * f.rows + r] = at[0];
             if (slot->row == 1)
-                for (int t = 0; t < f.times; ++t)
+                for (int t = 0; t < f.times; ++t) {
+                    for (int r = 0; r < f.rows; r += W) __builtin_prefetch(at + (t + 8) * slot->time + r);
                     for (int r = 0; r < f.rows; ++r) column[t * f.rows + r] = at[t * slot->time + r];
+                }
             else
                 for (int r = 0; r < f.rows; ++r) {
                     const int first = r < there ? (done - e + entries - 1) / entries : 0;

@@ -12,6 +12,7 @@ from . import cache
 from .adjoint_steps import ReversedStep
 from .cache import Trace
 from .call import Compiled
+from .compiler import REVERSED
 from .contents import Contents
 from .emit.cpp import emit
 from .emit.cuda import Dtypes, emit_cuda
@@ -90,15 +91,20 @@ def written(step: Step, given: Given, form: Form) -> Trace:
         return _record(text, traced, real)
     try:
         traced = _traced(step, given)
-        text = emit(*traced.program, form)
+        text = _emitted(step, traced, form)
     except NotLoweredError:
         if real == torch.float64:
             raise
         # float64 within a program of float32: all of it in double, rounded where it ends.
         real = torch.float64
         traced = _traced(step, given, widened=True)
-        text = emit(*traced.program, form)
+        text = _emitted(step, traced, form)
     return _record(text, traced, real)
+
+
+def _emitted(step: Step, traced: Traced, form: int) -> Text:
+    text = emit(*traced.program, form)
+    return text._replace(source=f"{REVERSED}\n{text.source}") if isinstance(step, ReversedStep) else text
 
 
 def _traced(step: Step, given: Given, *, widened: bool = False) -> Traced:

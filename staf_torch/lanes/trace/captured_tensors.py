@@ -25,13 +25,15 @@ _OF_NO_VALUES = frozenset(_NO_VALUES.split())
 """Operations whose result does not depend on the numbers of their arguments."""
 
 
+Operation = tuple[Any, Sequence[Any], dict[str, Any], Any]
+"""A function, its arguments, and what it returned."""
+
+
 class Recipe(NamedTuple):
     """The recipe by which the numbers of a table follow from the tensors that a step captured."""
 
     values: Tensor  # the numbers as they were, float64
-    operations: list[
-        tuple[Any, Sequence[Any], dict[str, Any], Any]
-    ]  # function, arguments, and what it returned
+    operations: list[Operation]
     reads: list[tuple[Tensor, np.ndarray[Any, Any]]]  # a tensor, and which places of its memory
     found: list[Tensor]  # floating-point tensors that were there before
     checks: list[tuple[Tensor, Any]]  # numbers that the step itself read, and depends on; lists of all
@@ -68,20 +70,23 @@ class TableSlopes:
     """
 
     def __init__(self, recipe: Recipe, of: Sequence[Tensor]) -> None:
-        self._recipe, self._of, start = recipe, of, 0
+        self._found, self._of, start = recipe.found, of, 0
+        operations, same = _different(recipe.operations)
         made = {id(tensor) for tensor in of}
-        for _, args, kwargs, out in recipe.operations:
+        for _, args, kwargs, out in operations:
             if any(id(t) in made for t in tensors((args, kwargs))):
                 made.update(id(t) for t in tensors(out))
         self.runs: list[tuple[int, int]] = []
-        self._reads = []
+        self._reads: list[tuple[int, Tensor | None]] = []  # of what, and which entries; None for all in order
         for tensor, at in recipe.reads:
-            if id(tensor) in made:
+            key = same.get(id(tensor), id(tensor))
+            if key in made and tensor.is_floating_point():
+                whole = np.array_equal(at, np.arange(tensor.numel()))
                 self.runs.append((start, len(at)))
-                self._reads.append((tensor, torch.from_numpy(at)))
+                self._reads.append((key, None if whole else torch.from_numpy(at)))
             start += len(at)
-        needed, kept = {id(tensor) for tensor, _ in self._reads}, []
-        for operation in reversed(recipe.operations):
+        needed, kept = {key for key, _ in self._reads}, []
+        for operation in reversed(operations):
             if any(id(t) in needed for t in tensors(operation[3])):
                 kept.append(operation)
                 needed.update(id(t) for t in tensors(operation[1:3]))
@@ -94,24 +99,53 @@ class TableSlopes:
             others: what stands in place of all that were found.
             by_numbers: slopes, run by run.
         """
-        known = {id(found): each.detach() for found, each in zip(self._recipe.found, others, strict=True)}
+        known = {id(found): each.detach() for found, each in zip(self._found, others, strict=True)}
         with torch.enable_grad():
             wanted = [known[id(tensor)].requires_grad_() for tensor in self._of]
             for function, args, kwargs, out in self._operations:
+                given = [known.get(id(x), x) if isinstance(x, Tensor) else _swapped(x, known) for x in args]
                 if function is torch.ops.aten.detach.default:  # of what autograd keeps; the same numbers
-                    known[id(out)] = _swapped(args[0], known)
+                    known[id(out)] = given[0]
                     continue
-                result = function(*_swapped(args, known), **_swapped(kwargs, known))
-                for old, new in zip(tensors(out), tensors(result), strict=True):
-                    known[id(old)] = new
-            read = [(known.get(id(tensor), tensor), at) for tensor, at in self._reads]
-            numbers = [tensor.reshape(-1)[at.to(tensor.device)] for tensor, at in read]
+                result = function(*given, **_swapped(kwargs, known)) if kwargs else function(*given)
+                if isinstance(out, Tensor):
+                    known[id(out)] = result
+                else:
+                    known.update(zip(map(id, tensors(out)), tensors(result), strict=True))
+            read = [(known[key].reshape(-1), at) for key, at in self._reads]
+            numbers = [x if at is None else x[at.to(x.device)] for x, at in read]
         pairs = [(x, slope.to(x)) for x, slope in zip(numbers, by_numbers, strict=True) if x.requires_grad]
         if not pairs:
             return [torch.zeros_like(x) for x in wanted]
         ends, slopes = zip(*pairs, strict=True)
         found = torch.autograd.grad(ends, wanted, slopes, allow_unused=True)
         return [torch.zeros_like(x) if y is None else y for x, y in zip(wanted, found, strict=True)]
+
+
+def _different(operations: Sequence[Operation]) -> tuple[list[Operation], dict[int, int]]:
+    """Return the operations without those that repeat an earlier one, and what stands for what these made."""
+    kept, same, met = list[Operation](), dict[int, int](), dict[Hashable, Any]()
+    first: dict[int, Tensor] = {}
+
+    def described(value: Any) -> Hashable:
+        if isinstance(value, Tensor):
+            return Tensor, same.get(id(value), id(value))
+        if isinstance(value, list | tuple):
+            return tuple(map(described, value))
+        return type(value), value  # 1, 1.0 and True are equal
+
+    for function, args, kwargs, out in operations:
+        given, named = _swapped(args, first), _swapped(kwargs, first)
+        try:
+            earlier = met.setdefault((function, described(given), described((*named.items(),))), out)
+        except TypeError:  # an argument that cannot be compared
+            earlier = out
+        if earlier is out or function._schema.is_mutable:
+            kept.append((function, given, named, out))
+            continue
+        for new, old in zip(tensors(out), tensors(earlier), strict=True):
+            same[id(new)], first[id(new)] = id(old), old
+    return kept, same
 
 
 class Captured:
