@@ -101,17 +101,19 @@ INLINE void gather_times(const Slot *slot, REAL *const *data, int slots, const F
         const int entries = int(slot->entries);
         const bool dense = slot->time == entries && (slot->entry == 1 || entries == 1) && slot->row > 1;
         const int done = dense && f.rows >= W ? transposed(from, slot->row, entries, f, to) : 0;
+        const bool far = slot->time * slot->time > int64_t(entries) * entries * f.rows * f.rows;
         const int there = done ? f.rows / W * W : 0;  // rows of which `done` numbers are there
         for (int e = 0; e < entries; ++e) {
             const REAL *const at = from + e * slot->entry;
             REAL *const column = to + int64_t(e) * f.span;
             for (int r = 0; r < lanes; ++r) column[f.times * f.rows + r] = at[0];
-            if (slot->row == 1)
-                for (int t = 0; t < f.times; ++t) {
-                    for (int r = 0; r < f.rows; r += W) __builtin_prefetch(at + (t + 8) * slot->time + r);
+            if (slot->row == 1) {
+                if (far)  // from time to time
+                    for (int t = 0; t < f.times; ++t)
+                        for (int r = 0; r < f.rows; r += W) __builtin_prefetch(at + (t + f.times) * slot->time + r);
+                for (int t = 0; t < f.times; ++t)
                     for (int r = 0; r < f.rows; ++r) column[t * f.rows + r] = at[t * slot->time + r];
-                }
-            else
+            } else
                 for (int r = 0; r < f.rows; ++r) {
                     const int first = r < there ? (done - e + entries - 1) / entries : 0;
                     for (int t = first; t < f.times; ++t) column[t * f.rows + r] = at[r * slot->row + t * slot->time];

@@ -8,26 +8,26 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from .adjoint_steps import Substituted
-from .backward import Backward, empty_rows, split
+from .backward import Backward
 from .call import Compiled, PlannedCall
 from .device.kernel import DeviceCall
 from .given import Given
 from .growth import Slope, grown, say_grown
 from .log import say
 from .row_numbers import RowNumbers, columns
+from .row_sums import empty_rows, split
 from .tree import Shared, flatten, labels, plain, unflatten
 
 if TYPE_CHECKING:
     from .program import Program
     from .texts import Built
-    from .trace.captured_tensors import TableSlopes
 
 _WORTH = 10  # operations of a step for each byte of its carry: kept, it costs less than the step again
 Plan = PlannedCall | DeviceCall
@@ -108,7 +108,7 @@ class GradientCall:
 
     Attributes:
         sizes: how many inputs a row has once, how many come at every time, and how many are the carry.
-        tables: what the latest backward pass used of the table.
+        followers: programs of adjoints, and the places of what was built of them.
     """
 
     def __init__(self, program: Program, given: Given, every: int) -> None:
@@ -117,9 +117,9 @@ class GradientCall:
         self.sizes = len(given.row), len(given.now), len(given.carry)
         self._shared = [isinstance(leaf, Shared) for leaf in (*given.row, *given.now, *given.carry)]
         self._plans: dict[Any, tuple[Compiled, Plan]] = {}
-        self.tables: dict[Any, TableSlopes] = {}
+        self.followers: dict[Hashable, tuple[Program, Hashable]] = {}
         self._refused = False
-        self.deciding, self.needed = program.deciding, program.needed
+        self.adjoints, self.needed = program.adjoints, program.needed
 
     def __call__(self, leaves: Sequence[Any]) -> tuple[Any, Any] | None:
         """Return the carry and the outputs, None where the definition must compute them.
@@ -156,7 +156,7 @@ class GradientCall:
             numbers=built.compiled.rows,
             versions=tuple((tensor, tensor._version) for tensor in fixed),
             kept=pays and self.every == 1 and size * self.rows * self.times <= _budget,
-            keeps=frozenset(self.needed or range(self.sizes[2])),
+            keeps=frozenset(self.needed.get(id(built.trace)) or range(self.sizes[2])),
             budget=_budget,
         )
 

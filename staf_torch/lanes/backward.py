@@ -10,16 +10,16 @@ number of rows alone.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Hashable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from .adjoint_steps import Deciding, Differentiated, ReversedStep, Substituted, adjoint_step, deciding
-from .call import fresh, inner_strides
 from .given import Given
 from .row_independence import undrawn
+from .row_sums import UNIT, AtTimes, by_units, empty_rows, halved, joined, split
 from .trace.captured_tensors import TableSlopes
 from .trace.step import Step
 from .tree import Shared, flatten, plain
@@ -27,9 +27,46 @@ from .tree import Shared, flatten, plain
 if TYPE_CHECKING:
     from .adjoint import Ran
     from .program import Program
+    from .texts import Built
 
-_UNIT = 64  # rows that are summed first, whatever the threads
 _ROWS = 32  # that the adjoint takes at once, at most
+
+
+class _Sum(NamedTuple):
+    """What slopes are summed over times by: its form in a row, and whether all rows share it."""
+
+    shape: torch.Size
+    dtype: torch.dtype
+    shared: bool
+
+
+class _Adjoint(NamedTuple):
+    """What is found out once of the adjoint of a program, whatever numbers its tensors have.
+
+    Args:
+        trace: of the program that keeps carries, by which it is known.
+        form: which gradients there are.
+        table: by which those of captured tensors follow from those of numbers of the table; None where the
+            adjoint has them itself.
+        sums: over times.
+        structures: of the adjoint's inputs.
+    """
+
+    trace: Any
+    form: Differentiated
+    table: TableSlopes | None
+    sums: list[_Sum]
+    structures: dict[str, Any]
+
+    @property
+    def kind(self) -> Hashable:
+        """Tells it from others of its program."""
+        return ("adjoint" if self.table is None else "reverse"), self.form, *self.runs
+
+    @property
+    def runs(self) -> tuple[tuple[int, int], ...]:
+        """The numbers of the table that have slopes."""
+        return () if self.table is None else tuple(self.table.runs)
 
 
 class Backward:
@@ -60,76 +97,88 @@ class Backward:
         self._of_captured = [k for k, need in enumerate(of_captured) if need]
         self._of_own = [k for k, need in enumerate(of_own) if need]
         self._end, self._ends = [*ends[: call.sizes[2]]], [*ends[call.sizes[2] :]]
-        carry, usual = self._deciding()
-        self._form = Differentiated(
-            carry=carry,
-            now=tuple(self._of_now),
-            shared=tuple(isinstance(leaf, Shared) for leaf in self._now),
-            row=tuple(self._of_row),
-            captured=tuple(ran.order[id(ran.captured[k])] for k in self._of_captured),
-            numbers=tuple(self._of_own),
-            outputs=tuple(end is not None for end in self._ends),
-        )
-        # What sums over times are by, and whether all rows share it.
-        summed = [
-            (plain(x), isinstance(x, Shared)) for x, w in zip(self._row, self._of_row, strict=True) if w
-        ]
-        own = [(self._own[k], False) for k in self._of_own]
-        self._table = self._slopes_of_table() if usual else None
-        self._runs = None if self._table is None else self._table.runs
-        self._summed: list[tuple[Tensor, bool]] = []
-        if self._runs is not None:
-            like = torch.empty(0, dtype=ran.built.compiled.real, device="cpu")
-            self._summed = [*summed, *((like.new_empty(size), True) for _, size in self._runs), *own]
-            self._build()
-            self._runs = None if self.built is None else self._runs
-        if self._runs is None:
-            self._summed = [*summed, *((self._captured[k], True) for k in self._of_captured), *own]
-            self._build()
+        self._order = tuple(ran.order[id(ran.captured[k])] for k in self._of_captured)
+        self._device = plain(next(iter((*self._carry, *self._row, *self._now)))).device
+        key = id(ran.built.trace), (*needs,), tuple([end is not None for end in ends]), self._order
+        self.built = self._known(key)
         # Leaves of the carry that the adjoint reads: what comes at a time begins with them.
         times = () if self.built is None else self.built.trace.times
         self._needed = {k for k in times if k < len(self._carry)}
-        call.needed.update(self._needed)
+        call.needed.setdefault(id(ran.built.trace), set()).update(self._needed)
         used = [] if self.built is None else self.built.compiled.rows
         places = {id(numbers): k for k, numbers in enumerate(ran.numbers)}
         self._read = [self._own[places[id(numbers)]] for numbers in used]
 
-    def _slopes_of_table(self) -> TableSlopes | None:
-        """What finds slopes by captured tensors from those by numbers of the table; None without."""
-        trace, wanted = self._ran.built.trace, tuple(self._ran.found[k] for k in self._of_captured)
-        known = self._call.tables.get((id(trace.recipe.operations), wanted))
-        if known is None and trace.recipe.repeats:
-            known = TableSlopes(trace.recipe, [trace.recipe.found[k] for k in wanted])
-            self._call.tables = {(id(trace.recipe.operations), wanted): known}  # keeps these alive
-        return known
+    def _known(self, key: Hashable) -> Built | None:
+        """Return what was built of the adjoint, now if there is nothing yet: of single numbers, or by
+        `torch.func.vjp`."""
+        known = self._call.adjoints
+        if key not in known:
+            carry, usual = self._deciding()
+            table, trace = None, self._ran.built.trace
+            if usual and trace.recipe.repeats:
+                table = TableSlopes(trace.recipe, [trace.recipe.found[k] for k in self._wanted()])
+                known[key] = self._planned(carry, table)
+            if table is None or self._build(key) is None:
+                known[key] = self._planned(carry, None)
+        self._adjoint = known[key]
+        return self._build(key)
 
-    def _build(self) -> None:
-        """Build the adjoint: of single numbers, or by `torch.func.vjp`."""
-        call, ran, runs = self._call, self._ran, self._runs
-        self._structures: dict[str, Any] = {}
-        few = slice(0, min(call.rows, _UNIT))
+    def _wanted(self) -> list[int]:
+        """Return the places of the captured tensors with a gradient among all that the trace found."""
+        return [self._ran.found[k] for k in self._of_captured]
+
+    def _planned(self, carry: tuple[bool, ...], table: TableSlopes | None) -> _Adjoint:
+        """Find out what does not depend on numbers."""
+        form = Differentiated(
+            carry=carry,
+            now=tuple(self._of_now),
+            shared=tuple(isinstance(leaf, Shared) for leaf in self._now),
+            row=tuple(self._of_row),
+            captured=self._order,
+            numbers=tuple(self._of_own),
+            outputs=tuple(end is not None for end in self._ends),
+        )
+
+        def one(x: Any, shared: bool) -> _Sum:
+            return _Sum(x.shape if shared else x.shape[1:], x.dtype, shared)
+
+        leaves = zip(self._row, self._of_row, strict=True)
+        sums = [one(plain(x), isinstance(x, Shared)) for x, wanted in leaves if wanted]
+        if table is None:
+            sums += [one(self._captured[k], True) for k in self._of_captured]
+        else:
+            real = self._ran.built.compiled.real
+            sums += [_Sum(torch.Size((size,)), real, True) for _, size in table.runs]
+        sums += [one(self._own[k], False) for k in self._of_own]
+        return _Adjoint(self._ran.built.trace, form, table, sums, {})
+
+    def _build(self, key: Hashable) -> Built | None:
+        """Return what was built of the adjoint."""
+        call, ran, adjoint = self._call, self._ran, self._call.adjoints[key]
+        self._adjoint, few = adjoint, slice(0, min(call.rows, UNIT))
+        program, place = call.followers.get((key, adjoint.kind), (None, None))
+        if program is not None and place is not None and (built := program.latest(place)) is not None:
+            self._on_processor = isinstance(place[1], int)
+            return built
         begin = [leaf[few] for leaf in self._carry]
         given = self._given(few, slice(0, 1), self._slopes(few), [leaf.unsqueeze(1) for leaf in begin], None)
+        program = call.program.follower(adjoint.kind, self._step, follows=ran.built.followed)
+        call.followers[key, adjoint.kind] = program, program.place(given)
         self._on_processor = given.ordinary() is True
-        kind = ("adjoint" if runs is None else "reverse"), self._form, *(runs or ())
-        program = call.program.follower(kind, self._step, follows=ran.built.followed)
-        self.built = program.built(given)
+        return program.built(given)
 
     def _deciding(self) -> Deciding:
         """What the adjoint depends on."""
         ends, outputs = ([end is not None for end in each] for each in (self._end, self._ends))
-        known = self._call.deciding.get((*ends, *outputs))
-        if known is None:
-            try:
-                own = [x[0].detach().requires_grad_(x.is_floating_point()) for x in self._own]
-                others: dict[int, Tensor] = dict(zip(map(id, self._ran.numbers), own, strict=True))
-                with Substituted(others), undrawn():
-                    known = deciding(self._call.program.step, self._one(), own, ends, outputs)
-            except Exception:  # of a step that is tried otherwise than it runs
-                forms = self._ran.built.compiled.carry
-                known = Deciding(tuple(dtype.is_floating_point for _, dtype in forms), usual=False)
-            self._call.deciding[(*ends, *outputs)] = known
-        return known
+        try:
+            own = [x[0].detach().requires_grad_(x.is_floating_point()) for x in self._own]
+            others: dict[int, Tensor] = dict(zip(map(id, self._ran.numbers), own, strict=True))
+            with Substituted(others), undrawn():
+                return deciding(self._call.program.step, self._one(), own, ends, outputs)
+        except Exception:  # of a step that is tried otherwise than it runs
+            forms = self._ran.built.compiled.carry
+            return Deciding(tuple(dtype.is_floating_point for _, dtype in forms), usual=False)
 
     def _one(self) -> Given:
         """Return one row and one time."""
@@ -140,14 +189,14 @@ class Backward:
     def _step(self, program: Program) -> Step:
         """Return the adjoint of a program's step: of the call's, or of that which it follows."""
         trace = self._ran.built.trace
-        if self._runs is not None:
+        if self._adjoint.table is not None:
             one = self._one()
             carry, now, row = ([_copied(x) for x in part] for part in (one.carry, one.now, one.row))
             given = Given(carry, now, row, one.structures, 1, 1)
-            return ReversedStep(program.step, given, self._form, tuple(self._runs))
-        found = [program.in_place_of(trace.recipe.found[self._ran.found[k]]) for k in self._of_captured]
+            return ReversedStep(program.step, given, self._adjoint.form, self._adjoint.runs)
+        found = [program.in_place_of(trace.recipe.found[k]) for k in self._wanted()]
         numbers = [program.in_place_of(trace.rows[k]) for k in self._of_own]
-        return adjoint_step(program.step, self._call.structures, self._form, found, numbers)
+        return adjoint_step(program.step, self._call.structures, self._adjoint.form, found, numbers)
 
     def run(self, kept: Sequence[Tensor]) -> list[Tensor | None]:
         """Return the gradients by all tensors.
@@ -159,7 +208,7 @@ class Backward:
             kept = []
         call, (rows, times) = self._call, self._blocks(bool(kept))
         slopes, sums = list[list[Tensor]](), list[list[Tensor]]()
-        at_times = _AtTimes(
+        at_times = AtTimes(
             [x for x, need in zip(self._now, self._of_now, strict=True) if need],
             call.rows,
             call.times,
@@ -169,27 +218,38 @@ class Backward:
             block = slice(start, min(start + rows, call.rows))
             after, total = self._block(block, times, kept, at_times)
             slopes.append(after)
-            pairs = zip(total, self._summed, strict=True)
-            sums.append([_units(x) if shared else x for x, (_, shared) in pairs])
-        carried = [_joined(parts) for parts in zip(*slopes, strict=True)]
-        places = [k for k, decides in enumerate(self._form.carry) if decides]
+            sums.append(self._of_units(total))
+        carried = [joined(parts) for parts in zip(*slopes, strict=True)]
+        places = [k for k, decides in enumerate(self._adjoint.form.carry) if decides]
         self.slopes = [*zip(places, carried, strict=True)]
         return self._sorted(
             carried,
-            [_joined(parts) for parts in zip(*sums, strict=True)],
+            [joined(parts) for parts in zip(*sums, strict=True)],
             at_times.joined(),
         )
+
+    def _of_units(self, total: Sequence[Tensor]) -> list[Tensor]:
+        """Return the sums of some rows: of each, and as one tensor, by 64 rows, those that all rows share."""
+        pairs = [*zip(total, self._adjoint.sums, strict=True)]
+        shared = [x.reshape(len(x), -1) for x, one in pairs if one.shared]
+        return [
+            *(x for x, one in pairs if not one.shared),
+            *([by_units(torch.cat(shared, 1))] if shared else []),
+        ]
 
     def _sorted(
         self, slopes: Sequence[Tensor], sums: Sequence[Tensor], at_times: Sequence[Tensor]
     ) -> list[Tensor | None]:
         """Gradients in the order of the tensors."""
-        pairs = zip(sums, self._summed, strict=True)
-        totals = iter([_halved(x, 0).to(of.dtype) if shared else x.to(of.dtype) for x, (of, shared) in pairs])
+        kinds = self._adjoint.sums
+        shared, alone = [one for one in kinds if one.shared], iter(sums)
+        together = iter(halved(sums[-1], 0).split([x.shape.numel() for x in shared]) if shared else ())
+        pairs = [(next(together).view(x.shape) if x.shared else next(alone), x.dtype) for x in kinds]
+        totals = iter([x.to(dtype) for x, dtype in pairs])
         times, carries = iter(at_times), iter(slopes)
         row = [next(totals) if need else None for need in self._of_row]
         now = [next(times) if need else None for need in self._of_now]
-        each = [next(carries) if decides else None for decides in self._form.carry]
+        each = [next(carries) if decides else None for decides in self._adjoint.form.carry]
         carry = [x if need else None for x, need in zip(each, self._of_carry, strict=True)]
         of_captured = iter(self._by_captured(totals))
         captured = [next(of_captured) if k in self._of_captured else None for k in range(len(self._captured))]
@@ -197,9 +257,10 @@ class Backward:
 
     def _by_captured(self, totals: Iterator[Tensor]) -> list[Tensor]:
         """Gradients by captured tensors, through the numbers of the table that follow from them."""
-        if self._runs is None or self._table is None:
+        table = self._adjoint.table
+        if table is None:
             return [next(totals) for _ in self._of_captured]
-        return self._table(self._ran.read, [next(totals) for _ in self._runs])
+        return table(self._ran.read, [next(totals) for _ in table.runs])
 
     def _numbers(self, totals: Any) -> list[Tensor | None]:
         return [next(totals) if k in self._of_own else None for k in range(len(self._own))]
@@ -207,9 +268,9 @@ class Backward:
     def _blocks(self, kept: bool) -> tuple[int, int]:
         """Return how many rows, and how many times of theirs, are taken at once."""
         call, threads = self._call, torch.get_num_threads()
-        unit, compiled = _UNIT * threads, self._ran.built.compiled
+        unit, compiled = UNIT * threads, self._ran.built.compiled
         size = max(1, sum(shape.numel() for shape, _ in compiled.carry) * compiled.real.itemsize)
-        sums = sum((x.numel() if shared else x[0].numel()) for x, shared in self._summed) * 8
+        sums = sum(x.shape.numel() for x in self._adjoint.sums) * 8
         most = self._ran.budget // (4 * sums + 1)  # rows of which the sums fit
         rows = max(unit, most // unit * unit)
         if kept:
@@ -223,7 +284,7 @@ class Backward:
         return max(unit, min(rows, self._ran.budget // (2 * begins)) // unit * unit), times
 
     def _block(
-        self, rows: slice, times: int, kept: Sequence[Tensor], at_times: _AtTimes
+        self, rows: slice, times: int, kept: Sequence[Tensor], at_times: AtTimes
     ) -> tuple[list[Tensor], list[Tensor]]:
         """Run some rows from the last time to the first: gradients by their carry, and sums over times."""
         call = self._call
@@ -243,14 +304,15 @@ class Backward:
             assert self.built is not None
             rooms = self._rooms(rows, piece, at_times)
             found = call.run(self.built, given, own, 1, back=True, rooms=rooms, again=again)
-            slopes, sums, slow = split(found, (len(slopes), len(self._summed), len(at_times.leaves)))
+            slopes, sums, slow = split(found, (len(slopes), len(self._adjoint.sums), len(at_times.leaves)))
             at_times.put(rows, piece, slow)
         return slopes, sums or []
 
     def _slopes(self, rows: slice) -> list[Tensor]:
         """Gradients by the carry after the last time."""
-        triples = zip(self._carry, self._end, self._form.carry, strict=True)
-        return [torch.zeros_like(x[rows]) if end is None else end[rows] for x, end, one in triples if one]
+        triples = zip(self._carry, self._end, self._adjoint.form.carry, strict=True)
+        zero = torch.zeros((), dtype=self._ran.built.compiled.real, device=self._device)
+        return [zero.expand(x[rows].shape) if end is None else end[rows] for x, end, one in triples if one]
 
     def _carries(self, rows: slice, times: slice, begin: Sequence[Tensor], every: int) -> list[Tensor]:
         """The carry before times of some rows, computed again."""
@@ -276,7 +338,7 @@ class Backward:
         sizes = rows.stop - rows.start, times.stop - times.start
         return Given([*begin], now, row, self._call.structures, *sizes), [x[rows] for x in self._own]
 
-    def _rooms(self, rows: slice, times: slice, at_times: _AtTimes) -> list[Tensor]:
+    def _rooms(self, rows: slice, times: slice, at_times: AtTimes) -> list[Tensor]:
         """Return the place of a block: outputs of times lie among those of all rows."""
         if not self._on_processor or self.built is None:
             return []
@@ -298,27 +360,23 @@ class Backward:
         sums: Sequence[Tensor] | None,
     ) -> Given:
         """Return the inputs of the adjoint."""
-        count, real = rows.stop - rows.start, self._ran.built.compiled.real
+        count, adjoint, structures = rows.stop - rows.start, self._adjoint, self._adjoint.structures
         if sums is None:
-            shapes = [x.shape if shared else x.shape[1:] for x, shared in self._summed]
-            sums = [torch.zeros((count, *shape), dtype=real, device=self._device) for shape in shapes]
+            zero = torch.zeros((), dtype=self._ran.built.compiled.real, device=self._device)
+            sums = [zero.expand(count, *x.shape) for x in adjoint.sums]
         ends = [self._at(end, rows, times) for end in self._ends if end is not None]
         captured, own = list[Shared](), list[Tensor]()
-        if self._runs is None:
+        if adjoint.table is None:
             captured = [Shared(self._captured[k]) for k in self._of_captured]
             own = [self._own[k][rows] for k in self._of_own]
         carry = [*slopes], [*sums]
         now = [*before], self._some(self._now, rows, times), ends
         row = self._some(self._row, rows, None), captured, own
-        if not self._structures:
+        if not structures:
             trees = {"carry": carry, "now": now, "row": row}
-            self._structures = {n: flatten(tuple(map(tuple, tree)))[1] for n, tree in trees.items()}
+            structures.update({n: flatten(tuple(map(tuple, tree)))[1] for n, tree in trees.items()})
         flat: list[list[Any]] = [[x for part in parts for x in part] for parts in (carry, now, row)]
-        return Given(flat[0], flat[1], flat[2], self._structures, count, times.stop - times.start)
-
-    @property
-    def _device(self) -> torch.device:
-        return plain(next(iter((*self._carry, *self._row, *self._now)))).device
+        return Given(flat[0], flat[1], flat[2], structures, count, times.stop - times.start)
 
     def _at(self, end: Tensor, rows: slice, times: slice) -> Tensor:
         """Gradients by an output at all times, some of which were recorded."""
@@ -331,83 +389,6 @@ class Backward:
         return spread
 
 
-class _AtTimes:
-    """Gradients by what times bring, put together of blocks of rows and times.
-
-    Args:
-        leaves: what they are by.
-        rows, times: all of them.
-        like: dtype and device.
-    """
-
-    def __init__(self, leaves: Sequence[Any], rows: int, times: int, like: Tensor) -> None:
-        self.leaves, self.like = leaves, like
-        self._found: list[Tensor] = []
-        for leaf in leaves:
-            shared = isinstance(leaf, Shared)
-            shape, count = leaf.tensor.shape[1:] if shared else leaf.shape[2:], -(-rows // _UNIT)
-            self._found.append(empty_rows(like, count if shared else rows, (times,), shape))
-
-    def rooms(self, rows: slice, times: slice) -> list[Tensor]:
-        """Return where those of a block are written to."""
-        count, length = rows.stop - rows.start, times.stop - times.start
-        return [
-            empty_rows(self.like, count, (length,), leaf.tensor.shape[1:])
-            if isinstance(leaf, Shared)
-            else found[rows, times]
-            for leaf, found in zip(self.leaves, self._found, strict=True)
-        ]
-
-    def put(self, rows: slice, times: slice, slopes: Sequence[Tensor]) -> None:
-        """Add those of a block, (rows, times, ...), that are not in their place."""
-        for leaf, slope, found in zip(self.leaves, slopes, self._found, strict=True):
-            if isinstance(leaf, Shared):
-                found[rows.start // _UNIT : -(-rows.stop // _UNIT), times] = _units(slope)
-            elif slope.data_ptr() != found[rows, times].data_ptr():
-                found[rows, times] = slope
-
-    def joined(self) -> list[Tensor]:
-        """Return those of all rows and times."""
-        pairs = zip(self.leaves, self._found, strict=True)
-        return [
-            _halved(x, 0).to(of.tensor.dtype) if isinstance(of, Shared) else x.to(of.dtype) for of, x in pairs
-        ]
-
-
-def empty_rows(like: Tensor, rows: int, times: tuple[int, ...], shape: Sequence[int]) -> Tensor:
-    """Return an empty tensor (rows, *times, *shape) in whose memory the rows are innermost."""
-    size = torch.Size(shape).numel() * rows
-    strides = (1, *[size for _ in times], *inner_strides(shape, rows))
-    return fresh(like, *times, size).as_strided((rows, *times, *shape), strides)
-
-
 def _copied(leaf: Any) -> Any:
     """Return an input with memory of its own."""
     return Shared(leaf.tensor.clone()) if isinstance(leaf, Shared) else leaf.clone()
-
-
-def _units(x: Tensor) -> Tensor:
-    """Sums over 64 rows each."""
-    missing = -len(x) % _UNIT
-    if missing:
-        x = torch.cat((x, x.new_zeros((missing, *x.shape[1:]))))
-    return _halved(x.unflatten(0, (-1, _UNIT)), 1)
-
-
-def _halved(x: Tensor, dim: int) -> Tensor:
-    """The sum over a dimension by halves: the same bits on any number of threads."""
-    while (count := x.shape[dim]) > 1:
-        half = count // 2
-        both = x.narrow(dim, 0, half) + x.narrow(dim, half, half)
-        x = torch.cat((both, x.narrow(dim, 2 * half, 1)), dim) if count % 2 else both
-    return x.squeeze(dim)
-
-
-def _joined(parts: Sequence[Tensor]) -> Tensor:
-    return parts[0] if len(parts) == 1 else torch.cat([*parts])
-
-
-def split(leaves: Sequence[Any], sizes: Sequence[int]) -> list[list[Any]]:
-    """Return consecutive parts of these sizes."""
-    rest = iter(leaves)
-    return [[next(rest) for _ in range(size)] for size in sizes]

@@ -39,7 +39,7 @@ def grown(program: str, ends: Sequence[Tensor], found: Sequence[Tensor]) -> bool
         return False
     rows = max(1, len(ends[0]))
     few = _sum([end[:: rows // _FEW + 1] for end in ends])  # all of them are no less
-    if not any(_beyond(part, _GROWN * few / rows) for part in found if part.numel()):
+    if few == few and not any(_beyond(part, _GROWN * few / rows) for part in found if part.numel()):
         return False
     came = _sum(ends)
     if came != came:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ..signs import Sign
-from .adjoint_steps import Deciding, keeping_step
+from .adjoint_steps import keeping_step
 from .call import Compiled, form, ordinary, served
 from .compiler import machine_code
 from .contents import Contents, Derived
@@ -79,8 +79,8 @@ class Program(Derived):
         self._model: tuple[Program, Mapping[int, Tensor]] | None = None
         self._builds = False  # whether that is built first, if it was not
         self._followers: dict[Hashable, Program] = {}  # of steps that are made from this one
-        self.deciding: dict[Hashable, Deciding] = {}  # by what has a gradient
-        self.needed = set[int]()  # leaves of the carry that an adjoint reads, once there was one
+        self.adjoints: dict[Hashable, Any] = {}  # what is known of them, by the trace and what has a gradient
+        self.needed: dict[int, set[int]] = {}  # by the trace: leaves of the carry that its adjoint reads
         self._tensors: Sequence[Tensor] = ()  # that the step reads, as far as is known
         self._described: tuple[bytes, Sequence[Tensor]] | None = None
         self._read: Contents | None = None  # what the step reads, once it is compiled
@@ -125,6 +125,7 @@ class Program(Derived):
         program = Program(step, name=self.name, compile=self.compile, copies=self.copies)
         program._model = self, {id(old): new for old, new in others}
         program._of_users, program._asked, program._refused = self._of_users, self._asked, self._refused
+        program.adjoints, program.needed = self.adjoints, self.needed
         return program
 
     @opaque
@@ -301,11 +302,10 @@ class Program(Derived):
 
     def built(self, given: Given) -> Built | None:
         """Return the code built for such inputs, None where there is none."""
-        where = given.ordinary()
+        where, key = given.ordinary(), self.place(given)
         if not self.compile or not where:
             return None
-        form = (self.copies or int(given.rows <= _FEW)) if where is True else where
-        key = given.key(), form
+        form: Form = key[1]
         with (
             self._lock,
             torch.device("cpu" if where is True else where),
@@ -316,6 +316,15 @@ class Program(Derived):
                     read = (*self._tensors, *built.trace.recipe.found, *built.trace.rows)
                     self._tensors = [*{id(t): t for t in map(self.in_place_of, read)}.values()]
             return self._compiled[key]
+
+    def place(self, given: Given) -> tuple[Hashable, Any]:
+        """Return where what is built for such inputs stands: by their forms and that of the code."""
+        where = given.ordinary()
+        return given.key(), (self.copies or int(given.rows <= _FEW)) if where is True else where
+
+    def latest(self, place: Hashable) -> Built | None:
+        """Return what was built at a place, None where there is nothing now."""
+        return self._compiled.get(place) if self.compile else None
 
     def in_place_of(self, tensor: Some) -> Some:
         """Return the tensor that stands where the program that this one follows had another, or itself."""
@@ -391,7 +400,7 @@ class Program(Derived):
             if read.renewed() and self._renew():
                 return
             self._compiled, self._followers, self._tensors = {}, {}, ()
-            self.deciding, self.needed = {}, set()
+            self.adjoints, self.needed = {}, {}
             self._read = self._model = self._refused = None
             self._asked = 0
 

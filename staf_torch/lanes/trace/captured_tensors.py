@@ -114,11 +114,11 @@ class TableSlopes:
                     known.update(zip(map(id, tensors(out)), tensors(result), strict=True))
             read = [(known[key].reshape(-1), at) for key, at in self._reads]
             numbers = [x if at is None else x[at.to(x.device)] for x, at in read]
-        pairs = [(x, slope.to(x)) for x, slope in zip(numbers, by_numbers, strict=True) if x.requires_grad]
-        if not pairs:
+            pairs = [(x, s.to(x)) for x, s in zip(numbers, by_numbers, strict=True) if x.requires_grad]
+            sums = [torch.dot(x, slope) for x, slope in pairs]  # given slopes, torch imports SymPy
+        if not sums:
             return [torch.zeros_like(x) for x in wanted]
-        ends, slopes = zip(*pairs, strict=True)
-        found = torch.autograd.grad(ends, wanted, slopes, allow_unused=True)
+        found = torch.autograd.grad(sums, wanted, allow_unused=True)
         return [torch.zeros_like(x) if y is None else y for x, y in zip(wanted, found, strict=True)]
 
 
