@@ -108,7 +108,7 @@ class GradientCall:
 
     Attributes:
         sizes: how many inputs a row has once, how many come at every time, and how many are the carry.
-        followers: programs of adjoints, and the places of what was built of them.
+        followers: programs of adjoints, the places of what was built of them, and of which trace they are.
     """
 
     def __init__(self, program: Program, given: Given, every: int) -> None:
@@ -117,9 +117,9 @@ class GradientCall:
         self.sizes = len(given.row), len(given.now), len(given.carry)
         self._shared = [isinstance(leaf, Shared) for leaf in (*given.row, *given.now, *given.carry)]
         self._plans: dict[Any, tuple[Compiled, Plan]] = {}
-        self.followers: dict[Hashable, tuple[Program, Hashable]] = {}
+        self.followers: dict[Hashable, tuple[Program, tuple[Hashable, Any], Any]] = {}
         self._refused = False
-        self.adjoints, self.needed = program.adjoints, program.needed
+        self.adjoints = program.adjoints
 
     def __call__(self, leaves: Sequence[Any]) -> tuple[Any, Any] | None:
         """Return the carry and the outputs, None where the definition must compute them.
@@ -139,6 +139,11 @@ class GradientCall:
         outputs = ran.built.compiled.structure[1][0]  # beside them it has the carries
         return unflatten(self.structures["carry"], rooms), unflatten(outputs, rooms)
 
+    def needed(self, trace: Any) -> set[int]:
+        """Return the leaves of the carry that adjoints of a trace read; none before there was one."""
+        found: set[int] = self.adjoints.setdefault(id(trace), (trace, set()))[1]
+        return found
+
     def _ran(self, keeping: Program, built: Built) -> Ran:
         read = [keeping.in_place_of(tensor) for tensor in built.trace.recipe.found]
         found = tuple(k for k, tensor in enumerate(read) if tensor.requires_grad)
@@ -156,7 +161,7 @@ class GradientCall:
             numbers=built.compiled.rows,
             versions=tuple((tensor, tensor._version) for tensor in fixed),
             kept=pays and self.every == 1 and size * self.rows * self.times <= _budget,
-            keeps=frozenset(self.needed.get(id(built.trace)) or range(self.sizes[2])),
+            keeps=frozenset(self.needed(built.trace) or range(self.sizes[2])),
             budget=_budget,
         )
 

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from .program import Program
     from .texts import Built
 
+_KNOWN = 64  # adjoints of which something is known
 _ROWS = 32  # that the adjoint takes at once, at most
 
 
@@ -104,7 +105,7 @@ class Backward:
         # Leaves of the carry that the adjoint reads: what comes at a time begins with them.
         times = () if self.built is None else self.built.trace.times
         self._needed = {k for k in times if k < len(self._carry)}
-        call.needed.setdefault(id(ran.built.trace), set()).update(self._needed)
+        call.needed(ran.built.trace).update(self._needed)
         used = [] if self.built is None else self.built.compiled.rows
         places = {id(numbers): k for k, numbers in enumerate(ran.numbers)}
         self._read = [self._own[places[id(numbers)]] for numbers in used]
@@ -114,6 +115,8 @@ class Backward:
         `torch.func.vjp`."""
         known = self._call.adjoints
         if key not in known:
+            if len(known) >= _KNOWN:
+                known.clear()
             carry, usual = self._deciding()
             table, trace = None, self._ran.built.trace
             if usual and trace.recipe.repeats:
@@ -157,14 +160,15 @@ class Backward:
         """Return what was built of the adjoint."""
         call, ran, adjoint = self._call, self._ran, self._call.adjoints[key]
         self._adjoint, few = adjoint, slice(0, min(call.rows, UNIT))
-        program, place = call.followers.get((key, adjoint.kind), (None, None))
-        if program is not None and place is not None and (built := program.latest(place)) is not None:
+        program, place, trace = call.followers.get((key, adjoint.kind), (None, None, None))
+        if program is not None and place is not None and trace is adjoint.trace:
             self._on_processor = isinstance(place[1], int)
-            return built
+            if (built := program.latest(place)) is not None:
+                return built
         begin = [leaf[few] for leaf in self._carry]
         given = self._given(few, slice(0, 1), self._slopes(few), [leaf.unsqueeze(1) for leaf in begin], None)
         program = call.program.follower(adjoint.kind, self._step, follows=ran.built.followed)
-        call.followers[key, adjoint.kind] = program, program.place(given)
+        call.followers[key, adjoint.kind] = program, program.place(given), adjoint.trace
         self._on_processor = given.ordinary() is True
         return program.built(given)
 

@@ -80,7 +80,6 @@ class Program(Derived):
         self._builds = False  # whether that is built first, if it was not
         self._followers: dict[Hashable, Program] = {}  # of steps that are made from this one
         self.adjoints: dict[Hashable, Any] = {}  # what is known of them, by the trace and what has a gradient
-        self.needed: dict[int, set[int]] = {}  # by the trace: leaves of the carry that its adjoint reads
         self._tensors: Sequence[Tensor] = ()  # that the step reads, as far as is known
         self._described: tuple[bytes, Sequence[Tensor]] | None = None
         self._read: Contents | None = None  # what the step reads, once it is compiled
@@ -125,7 +124,7 @@ class Program(Derived):
         program = Program(step, name=self.name, compile=self.compile, copies=self.copies)
         program._model = self, {id(old): new for old, new in others}
         program._of_users, program._asked, program._refused = self._of_users, self._asked, self._refused
-        program.adjoints, program.needed = self.adjoints, self.needed
+        program.adjoints = self.adjoints
         return program
 
     @opaque
@@ -302,20 +301,18 @@ class Program(Derived):
 
     def built(self, given: Given) -> Built | None:
         """Return the code built for such inputs, None where there is none."""
-        where, key = given.ordinary(), self.place(given)
-        if not self.compile or not where:
-            return None
-        form: Form = key[1]
-        with (
-            self._lock,
-            torch.device("cpu" if where is True else where),
-        ):  # what the step makes is where its inputs are, not on a default device
-            if key not in self._compiled:
-                built = self._compiled[key] = self._again(key, given) or self._build(given, form)
+        where, place = given.ordinary(), self.place(given)
+        known = self.latest(place) if self.compile and where else None
+        if known is not None or not self.compile or not where:
+            return known
+        # What the step makes is where its inputs are, not on a default device.
+        with self._lock, torch.device("cpu" if where is True else where):
+            if place not in self._compiled:
+                built = self._compiled[place] = self._again(place, given) or self._build(given, place[1])
                 if built is not None:
                     read = (*self._tensors, *built.trace.recipe.found, *built.trace.rows)
                     self._tensors = [*{id(t): t for t in map(self.in_place_of, read)}.values()]
-            return self._compiled[key]
+            return self._compiled[place]
 
     def place(self, given: Given) -> tuple[Hashable, Any]:
         """Return where what is built for such inputs stands: by their forms and that of the code."""
@@ -324,7 +321,7 @@ class Program(Derived):
 
     def latest(self, place: Hashable) -> Built | None:
         """Return what was built at a place, None where there is nothing now."""
-        return self._compiled.get(place) if self.compile else None
+        return self._compiled.get(place)
 
     def in_place_of(self, tensor: Some) -> Some:
         """Return the tensor that stands where the program that this one follows had another, or itself."""
@@ -399,8 +396,7 @@ class Program(Derived):
             self._prepared = {}
             if read.renewed() and self._renew():
                 return
-            self._compiled, self._followers, self._tensors = {}, {}, ()
-            self.adjoints, self.needed = {}, {}
+            self._compiled, self._followers, self._tensors, self.adjoints = {}, {}, (), {}
             self._read = self._model = self._refused = None
             self._asked = 0
 
