@@ -18,7 +18,7 @@ from ..trace.graph import FLAG, NARROW, REAL, ROW, STEP, WHOLE, WIDE, Graph
 from ..trace.tracer import LARGE, NotLoweredError
 from .c import Names, ScalarWriter, random_numbers
 from .rooms import in_rooms
-from .schedule import Schedule, Sizes
+from .schedule import Schedule, Sizes, made_again
 from .tables import TableWriter, Text
 
 KERNEL = "lanes_kernel"
@@ -101,6 +101,7 @@ class _CudaWriter(ScalarWriter, TableWriter):
     def __init__(self, graph: Graph, schedule: Schedule, layout: Sizes, names: Names, dtypes: Dtypes) -> None:
         super().__init__(graph, schedule, layout, names)
         self._all, self._dtypes = names, dtypes
+        self._remade = made_again(graph, schedule, LARGE) - self._taken_over
         self._constants: list[str] = []
         self._held = 0  # bytes of them
 

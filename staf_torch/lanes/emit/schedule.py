@@ -264,6 +264,42 @@ def taken_over(graph: Graph, schedule: Schedule) -> set[int]:
     return found
 
 
+_CHEAP = frozenset("add sub mul neg abs min max where copy lt le eq ne and or xor not".split())
+_SHORT = 6  # operations of an entry that is made again
+
+
+def made_again(graph: Graph, schedule: Schedule, least: int) -> set[int]:
+    """Find the maps of more than ``least`` entries that are made where they are read, however often.
+
+    Of few operations on numbers, on tables and on arrays that are shorter: memory for all entries costs more
+    where each row has its own. Whoever reads one stands in the same block.
+    """
+    readers, counts = defaultdict[int, list[int]](list), Counter[int]()
+    for node in schedule.live:
+        for argument in graph.args[node] if graph.op[node] != "loop" else ():
+            readers[argument].append(node)
+            counts[argument] += 1
+
+    def here(node: int) -> bool:
+        of = (readers[reader] if graph.op[reader] == "elem" else [reader] for reader in readers[node])
+        known = counts[node] == schedule.uses[node]
+        return known and all(schedule.together(reader, node) for some in of for reader in some)
+
+    length = dict[int, int]()
+    for node in sorted(schedule.live):
+        if graph.op[node] != "map" or graph.aux[node][0] not in _CHEAP or graph.size(node) <= least:
+            continue
+        arrays = [operand for operand in graph.args[node] if graph.size(operand) > least]
+        more = sum(length.get(operand, 0 if _fixed(graph, operand) else _SHORT) for operand in arrays)
+        if more < _SHORT and here(node):
+            length[node] = 1 + more
+    return set(length)
+
+
+def _fixed(graph: Graph, array: int) -> bool:
+    return graph.op[array] == "pack" and all(graph.op[node] in FIXED for node in graph.args[array])
+
+
 def leaves(
     graph: Graph, taken: Collection[int], node: int, at: Places = None
 ) -> Iterator[tuple[int, Places]]:

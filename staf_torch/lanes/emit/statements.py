@@ -76,7 +76,8 @@ class StatementWriter(abc.ABC):
         self._level = 1
         self._stored: dict[int, tuple[str, int]] = {}  # what is read from a buffer instead, and its place
         self._in_memory: set[int] = set()  # slots of the carry that are arrays
-        self._taken_over: set[int] = set()  # maps that are computed where they are read
+        self._taken_over: set[int] = set()  # maps that are computed where they are read, once
+        self._remade: set[int] = set()  # maps that are, however often
         self._starts = {
             "row": np.cumsum([0, *layout.rows]).tolist(),
             "now": np.cumsum([0, *layout.nows]).tolist(),
@@ -168,7 +169,7 @@ class StatementWriter(abc.ABC):
     def _block(self, nodes: Sequence[int]) -> None:
         for node in nodes:
             op = self.graph.op[node]
-            if op in _INPUTS or node in self._taken_over:
+            if op in _INPUTS or node in self._taken_over or node in self._remade:
                 continue
             if op == "loop":
                 self._loop(self.graph.aux[node])
@@ -357,6 +358,8 @@ class StatementWriter(abc.ABC):
     def _read(self, array: int, at: str, j: int) -> str:
         """Entry ``at`` of an array."""
         graph = self.graph
+        if array in self._remade:
+            return f"({self._made_again(array, at, j)})"
         if graph.op[array] == "pack" and all(graph.op[a] in FIXED for a in graph.args[array]):
             return self._table(array, at)
         if array in self._stored:
@@ -372,6 +375,22 @@ class StatementWriter(abc.ABC):
             number, k, _ = graph.aux[array]
             name = f"{'y' if graph.op[array] == 'collect' else 'l'}{number}_{k}"
         return f"{name}[{at}]" if self.copies == 1 else f"{name}[({at}) * {self.copies} + {j}]"
+
+    def _made_again(self, node: int, at: str, j: int) -> str:
+        """The expression of an entry of a map that is not kept."""
+        sizes = [s for s in self.graph.aux[node][1] if s > 1]
+        below = [math.prod(sizes[d + 1 :]) for d in range(len(sizes))]
+        names = [f"((unsigned)({at}) / {b} % {size})" for b, size in zip(below, sizes, strict=True)]
+        ats = []
+        for _, places in leaves(self.graph, self._taken_over, node):
+            flat, index = evenly(places, [math.prod(sizes)]), evenly(places, sizes)
+            if places is not None and at.isdigit():
+                ats.append(str(places[int(at)]))
+            elif flat is not None:
+                ats.append(self._sum([f"({at})"], *flat))
+            else:
+                ats.append(self._lookup(places, at) if index is None else self._sum(names, *index))
+        return self._mapped(node, iter(ats), j)
 
     def _in_place(self, pack: int) -> tuple[str, int] | None:
         """Return the place in a buffer of inputs where the entries of a pack lie in order already."""
