@@ -495,6 +495,7 @@ ANYWHERE: dict[str, Callable[[Any], Callable[[Tensor], Tensor]]] = {
     "torch.tensor": lambda k: lambda x: x * torch.tensor([k, 1.0]),
     "new_full": lambda k: lambda x: x + x.new_full(x.shape[1:], k),
     "derivative": lambda k: lambda x: torch.func.grad(lambda y: (k * y.sin()).sum())(x),
+    "text": lambda k: lambda x: x * float(f"{k:.17g}"),
     "branch": lambda k: lambda x: x * 2 if k > 1.5 else x,
     "constructor": lambda k: lambda x: systems.Pendulum(mass=k).drift(x),
 }
@@ -510,7 +511,22 @@ def test_a_users_function_may_read_numbers_of_rows_wherever_torch_takes_numbers(
         torch.testing.assert_close(
             run((), (), x, steps=1)[1][:, 0], torch.cat(singles), rtol=1e-14, atol=1e-14
         )
-    assert program.compiled == (name not in ("new_full", "branch"))  # which want a Python number
+    assert program.compiled == (name not in ("new_full", "text", "branch"))  # which want a Python number
+
+
+def test_a_policy_takes_its_number_out_of_torch_and_what_is_differentiated_may_not() -> None:
+    plant, cost, gains = systems.Pendulum(), adp.QuadraticCost(1.0, 1.0, 2, 1), spread(1.0, 2.0)
+
+    def run(gain: Any, x0: Tensor) -> Tensor:
+        policy = adp.Feedback(lambda x: -float(gain) * x[..., :1])
+        return adp.simulate(policy, plant, cost, x0, dt=0.02, steps=2).state
+
+    found = run(st.rows(gains), starts(FEW))
+    for row, gain in enumerate(gains):
+        assert torch.equal(found[row : row + 1], run(gain, starts(FEW)[row : row + 1]))
+    wall = st.rows(gains)
+    with pytest.raises(ValueError, match=r"numbers leave torch at .*test_rows.py.* write it with torch"):
+        adp.SafetyFilter(adp.LQR(plant, cost), plant, lambda x, t: float(wall.numpy()) - x[:, 0], dt=0.05)
 
 
 def test_equilibria_and_bounds_beside_a_cost_take_rows_and_theorems_refuse_them() -> None:

@@ -11,7 +11,9 @@ function looks up; they announce themselves.
 
 from __future__ import annotations
 
+import contextlib
 import copy
+import functools
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -19,6 +21,7 @@ from typing import Any, ClassVar, TypeVar
 
 import torch
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_flatten, tree_map, tree_unflatten
 
 from .tree import Shared, Tree, flatten, unflatten
@@ -41,7 +44,7 @@ _READS_NAMES = """__bool__ __float__ __int__ __index__ __complex__ __contains__ 
     equal
     allclose is_nonzero data_ptr"""
 _READS = frozenset(_READS_NAMES.split())
-
+_MAKES = ("tensor", "as_tensor", "asarray")  # of numbers, also those of tensors in lists
 _ENTRYWISE = frozenset(f"aten::{name}" for name in ("_to_copy", "detach", "clone", "alias", "lift_fresh"))
 
 
@@ -105,7 +108,10 @@ class RowNumbers(Tensor):
         return f"rows({self.full!r})"
 
     def __format__(self, form: str) -> str:
-        return repr(self)
+        resolve: Resolve | None = getattr(_active, "resolve", None)
+        if resolve is None or not (form or resolve is not refuse):
+            return repr(self)
+        return format(resolve(self), form)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> RowNumbers:
         if id(self) not in memo:
@@ -291,11 +297,8 @@ def _mapped(function: Callable[..., Some], given: tuple[Tree, ...], met: RowNumb
             ends, shape = flatten(function(*unflatten(structure, iter(alone))))
         return tuple(end.squeeze(0) for end in ends)
 
-    try:
-        found = torch.func.vmap(one, randomness="different")(indices, *own)
-    except (RuntimeError, ValueError) as error:
-        if not _decides(error):
-            raise
+    found = _at_once(lambda: torch.func.vmap(one, randomness="different")(indices, *own))
+    if found is None:
         each, before = [], one_by_one()
         _active.apart = before * count
         try:
@@ -307,6 +310,49 @@ def _mapped(function: Callable[..., Some], given: tuple[Tree, ...], met: RowNumb
         found = tuple(torch.stack(column) for column in zip(*each, strict=True))
     some: Some = unflatten(shape, iter(found))
     return some
+
+
+def _at_once(mapped: Callable[[], tuple[Tensor, ...]]) -> tuple[Tensor, ...] | None:
+    """Return mapped(); None where a function reads values, but for those that `torch.tensor` makes one of."""
+    for inside in (contextlib.nullcontext(), _Makes()):
+        try:
+            with inside:
+                return mapped()
+        except (RuntimeError, ValueError) as error:
+            if not _decides(error):
+                raise
+    return None
+
+
+class _Makes(TorchFunctionMode):
+    """Context in which `torch.tensor([a, 1.0])` of a row's number a is a stack, as it is in compiled code."""
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        made = made_of_list(func, args, kwargs or {})
+        return func(*args, **(kwargs or {})) if made is None else made
+
+
+def made_of_list(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Tensor | None:
+    """Return what `torch.tensor` makes of nested lists that hold tensors, in operations of torch; None of
+    another function."""
+    if getattr(func, "__name__", "") not in _MAKES or not args or not isinstance(args[0], list | tuple):
+        return None
+    if not any(isinstance(leaf, Tensor) for leaf in tree_flatten(args[0])[0]):
+        return None
+    given = {name: kwargs.get(name) for name in ("dtype", "device")}
+    return torch.as_tensor(_stacked(args[0]), **given)
+
+
+def _stacked(parts: Any) -> Tensor:
+    """Return nested lists of numbers and tensors as a tensor, of which operations are seen."""
+    if not isinstance(parts, list | tuple):
+        return parts if isinstance(parts, Tensor) else torch.as_tensor(parts, device="cpu")
+    found = [_stacked(part) for part in parts]
+    real = functools.reduce(torch.promote_types, (part.dtype for part in found))
+    device = next((part.device for part in found if part.device.type != "cpu"), None)
+    return torch.stack([part.to(device or part.device, real) for part in found])
 
 
 def _decides(error: Exception) -> bool:

@@ -354,7 +354,7 @@ class Merge:
             return functools.partial(function, *args, **keywords)
         if isinstance(first, Derived):
             return kind(**self._dict([value.__getstate__() for value in values], name))
-        if hasattr(first, "__dict__") and not isinstance(first, type):
+        if hasattr(first, "__dict__") and not isinstance(first, type | str):
             made: Any = object.__new__(kind)
             self._made[key] = made
             held = [dict(vars(value)) for value in values]

@@ -13,6 +13,8 @@ from torch import Tensor, nn
 from torch.utils import _device
 from torch.utils._pytree import tree_map_only
 
+from ..lanes.trace.tracer import explained
+
 Given = ParamSpec("Given")
 Found = TypeVar("Found")
 
@@ -31,11 +33,16 @@ def beside(function: Callable[Given, Found]) -> Callable[Given, Found]:
 
     @functools.wraps(function)
     def placed(*args: Given.args, **more: Given.kwargs) -> Found:
-        if _device.CURRENT_DEVICE is None:
-            return function(*args, **more)
-        given = (each.device for each in (*args, *more.values()) if isinstance(each, Tensor))
-        with torch.device(next(given, torch.device("cpu"))):
-            return function(*args, **more)
+        try:
+            if _device.CURRENT_DEVICE is None:
+                return function(*args, **more)
+            given = (each.device for each in (*args, *more.values()) if isinstance(each, Tensor))
+            with torch.device(next(given, torch.device("cpu"))):
+                return function(*args, **more)
+        except RuntimeError as error:
+            if (instead := explained(error)) is error:
+                raise
+            raise instead from error
 
     return placed
 

@@ -19,6 +19,7 @@ from ...approximation.basis import StaFBasis
 from ...lanes import Program
 from ...lanes.call import served
 from ...lanes.contents import Contents
+from ...lanes.each_row import each_row
 from ...lanes.gradients import wants_gradient
 from ...lanes.row_decisions import decided
 from ...lanes.row_numbers import anybodys, over_rows
@@ -232,12 +233,12 @@ def _check(system: Plant, cost: Cost, x0: Tensor) -> tuple[Cost, bool]:
 
 
 def _check_control(controller: Feedback, x0: Tensor, inputs: int) -> None:
-    """Refuse a policy that is not one control a row; numbers of a row's own are its matter."""
+    """Refuse a policy that is not one control a row, of numbers of rows by those of the first."""
     if is_ours(controller.policy):
         return
     try:
         with torch.no_grad():
-            u = controller.policy(x0)
+            (u,) = each_row(lambda: controller.policy(x0), 1)
     except RuntimeError as error:
         if "dtype" not in str(error):
             raise

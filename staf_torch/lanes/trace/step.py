@@ -8,7 +8,6 @@ library's (`factorisations`, `eigenvalues`, `decompositions`), else torch's own 
 from __future__ import annotations
 
 import contextlib
-import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -20,7 +19,7 @@ from torch.overrides import TorchFunctionMode
 from ..emit.schedule import Sizes
 from ..given import Given
 from ..loops import tracing
-from ..row_numbers import RowNumbers, resolving
+from ..row_numbers import RowNumbers, made_of_list, resolving
 from ..tree import Shared, Tree, flatten, plain
 from . import eigenvalues, factorisations
 from . import reductions as reductions  # its rules
@@ -211,9 +210,8 @@ class _TorchFunctions(TorchFunctionMode):
                 chosen = wrapped or self._traced(args[0])
             if chosen:
                 return plain(*args, **kwargs)
-        if name in _MAKES and args and isinstance(args[0], list | tuple) and tensors(args[0]):
-            given = {name: kwargs.get(name) for name in ("dtype", "device")}
-            return torch.as_tensor(_stacked(args[0]), **given)
+        if (made := made_of_list(func, args, kwargs)) is not None:
+            return made
         if name in _LEAVES_TORCH:
             if self._traced(args[0]):
                 raise NotLoweredError(f"`Tensor.{name}` takes numbers of a row out of torch", name)
@@ -232,17 +230,6 @@ def _outside_transforms() -> Any:
     return temporarily_clear_interpreter_stack()
 
 
-def _stacked(parts: Any) -> Tensor:
-    """Return nested lists of numbers and tensors as a tensor, of which operations are seen."""
-    if not isinstance(parts, list | tuple):
-        return parts if isinstance(parts, Tensor) else torch.as_tensor(parts, device="cpu")
-    found = [_stacked(part) for part in parts]
-    real = functools.reduce(torch.promote_types, (part.dtype for part in found))
-    device = next((part.device for part in found if part.device.type != "cpu"), None)
-    return torch.stack([part.to(device or part.device, real) for part in found])
-
-
-_MAKES = ("tensor", "as_tensor", "asarray")  # of numbers, also those of tensors in lists
 _LEAVES_TORCH = ("numpy", "__array__", "tolist", "__dlpack__", "__repr__")
 _PLAIN: dict[Any, Callable[..., Any]] = {
     torch.linalg.eigvalsh: eigenvalues.eigenvalues,

@@ -47,12 +47,24 @@ class NotLoweredError(Exception):
 
     def __init__(self, reason: str, name: str = "") -> None:
         instead = instead_of(name)
-        super().__init__(f"{reason}{_where()}{'; ' + instead if instead else ''}")
+        super().__init__(f"{reason}{_where(traceback.extract_stack())}{'; ' + instead if instead else ''}")
 
 
-def _where() -> str:
+def explained(error: RuntimeError) -> Exception:
+    """Return the error of NumPy that asks for numbers while torch takes derivatives as a sentence that names
+    the line of code; another error as it is."""
+    if "data pointer of Tensor that doesn't have storage" not in str(error):
+        return error
+    where = _where(traceback.extract_tb(error.__traceback__))
+    return ValueError(
+        f"numbers leave torch{where}, in a function of which derivatives are taken; {instead_of('numpy')} "
+        f"({error})."
+    )
+
+
+def _where(frames: Sequence[traceback.FrameSummary]) -> str:
     """The innermost line of code outside of torch and this compiler."""
-    for frame in reversed(traceback.extract_stack()):
+    for frame in reversed(frames):
         if not frame.filename.startswith((*_OWN, "<")):
             return f" at {frame.filename}:{frame.lineno}: {(frame.line or '')[:_LINE]}"
     return ""
