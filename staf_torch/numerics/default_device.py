@@ -5,8 +5,9 @@ from __future__ import annotations
 import contextlib
 import copy
 import functools
+import logging
 from collections.abc import Callable, Iterator
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -17,6 +18,7 @@ from ..lanes.trace.tracer import explained
 
 Given = ParamSpec("Given")
 Found = TypeVar("Found")
+_log = logging.getLogger(__name__)
 
 
 def on(device: torch.device) -> contextlib.AbstractContextManager[object]:
@@ -70,6 +72,44 @@ def designed_on_cpu(function: Callable[Given, Found]) -> Callable[Given, Found]:
         return found
 
     return designed
+
+
+def where_held(
+    call: str, held: Callable[[Any], Tensor]
+) -> Callable[[Callable[Given, Found]], Callable[Given, Found]]:
+    """Decorate a method that computes where its object is: tensors of another device are moved there, what
+    it returns back, and that is logged once.
+
+    Args:
+        call: the method, for the log.
+        held: a tensor of the object.
+    """
+
+    def decorated(method: Callable[Given, Found]) -> Callable[Given, Found]:
+        @functools.wraps(method)
+        def moved(*args: Given.args, **more: Given.kwargs) -> Found:
+            owner, where = args[0], held(args[0]).device
+            first = next((each for each in (*args[1:], *more.values()) if isinstance(each, Tensor)), None)
+            if first is None or first.device == where:
+                return method(*args, **more)
+            _say_moved(call, where, first.device)
+            given = tree_map_only(Tensor, lambda each: each.to(where), (args[1:], more))
+            answer = method(owner, *given[0], **given[1])  # type: ignore[call-arg]
+            found: Found = tree_map_only(Tensor, lambda each: each.to(first.device), answer)
+            return found
+
+        return moved
+
+    return decorated
+
+
+@functools.cache
+def _say_moved(call: str, where: torch.device, given: torch.device) -> None:
+    _log.warning(
+        "%s computes on %s, where its object is: states on %s are moved there, answers back. "
+        "Modules moved with `.to(%r)` before compute there",
+        *(call, where, given, str(given)),
+    )
 
 
 def on_cpu(given: Found) -> Found:

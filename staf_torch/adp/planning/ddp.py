@@ -25,10 +25,10 @@ from ...lanes.row_numbers import over_rows, some_rows
 from ...lanes.tree import Tree, flatten, unflatten
 from ...numerics.box import minimum_and_slopes
 from ...numerics.checks import fail, integer, positive_real, trailing
-from ...numerics.default_device import beside
+from ...numerics.default_device import beside, where_held
 from ...numerics.riccati import riccati_step
 from ...signs import Sign
-from ..problem.sampled import Derivatives, SampledProblem
+from ..problem.sampled import Derivatives, SampledProblem, goal_of
 from .trajectories import (
     CostedTrajectories,
     End,
@@ -108,6 +108,7 @@ class BoxDDP:
         about = f"steps={self.steps}, iterations={self.iterations}, tolerance={self.tolerance:g}"
         return f"BoxDDP({self.problem!r}, {about})"
 
+    @where_held("BoxDDP.solve", goal_of)
     @opaque
     @without_gradient("BoxDDP.solve", "x0", "control", "reference", "terminal", "self")
     @Sign("BoxDDP")

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -13,6 +13,7 @@ from torch import Tensor
 from ...lanes import Program, scan
 from ...lanes.gradients import without_gradient
 from ...numerics.checks import fail, integer, positive, positive_real, trailing, vector
+from ...numerics.default_device import where_held
 from ...numerics.kept_precision import KeptPrecision
 from ..problem.rules import check_endless, check_regulator
 from ..problem.sampled import SampledProblem
@@ -38,6 +39,10 @@ def check_memorable(call: str, problem: SampledProblem) -> None:
     check_regulator(call, "problem", problem.unregulated)
     end = None if problem.endless else problem.end
     check_endless(call, "problem", end, "a memory of plans has no final time")
+
+
+def _held(memory: GlobalValue) -> Tensor:
+    return memory.plans
 
 
 class Choice(NamedTuple):
@@ -137,12 +142,22 @@ class GlobalValue(KeptPrecision):
 
         n, h = self.problem.dim, self.lookahead
         images = self.images()
-        self._rows = self.entries.repeat(len(images) // len(self.entries))
-        self._tree = cKDTree(images.numpy())
-        self._windows = self.plans.unfold(0, h, 1).mT  # (N length - h + 1, h, w), a view
+        self._rows = self.entries.cpu().repeat(len(images) // len(self.entries))
+        self._tree = cKDTree(images.cpu().numpy())
+        self._windows = self._seen_windows()
         # Where every trajectory rests at the goal, under the linear feedback.
         self.resting = int(self.arrives.nonzero()[0]) * self.length + self.length - h - 1
         self.worst = float(self.models[self.entries, n].max())
+
+    def _seen_windows(self) -> Tensor:
+        """A window of plans from every row on, (N length - h + 1, h, w), a view."""
+        return self.plans.unfold(0, self.lookahead, 1).mT
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """Move the windows, too."""
+        moved: Self = super()._apply(fn, recurse)
+        moved._windows = moved._seen_windows()
+        return moved
 
     def __getstate__(self) -> dict[str, Any]:
         dropped = dict.fromkeys(("_tree", "_windows", "_rows"))
@@ -152,6 +167,7 @@ class GlobalValue(KeptPrecision):
         super().__setstate__(state)  # type: ignore[no-untyped-call]
         self._ready()
 
+    @where_held("GlobalValue", _held)
     @without_gradient("GlobalValue", "x")
     def forward(self, x: Tensor) -> Tensor:
         """u: (..., n) -> (..., m)."""
@@ -162,7 +178,7 @@ class GlobalValue(KeptPrecision):
         if len(rows) == 1:
             entries = self.nearest(rows)[0]
             cost, control, covered = self._followed(rows.expand(self.candidates + 1, -1), entries)
-            best = int(cost.numpy().argmin())
+            best = int(cost.cpu().numpy().argmin())
             u, known = control[best], covered[best]
         else:
             found = self.choose(rows)
@@ -176,24 +192,28 @@ class GlobalValue(KeptPrecision):
             )
         return u if x.dim() == 2 else u.reshape(*x.shape[:-1], u.shape[-1])
 
+    @where_held("GlobalValue", _held)
     def value(self, x: Tensor) -> Tensor:
         """V(x), inf where no plan covers x: (..., n) -> (...)."""
         trailing("GlobalValue.value", "x", x, 1, self.problem.dim)
         found = self.choose(x.reshape(-1, x.shape[-1]).to(self.plans.dtype))
         return torch.where(found.covered, found.value, torch.inf).reshape(x.shape[:-1]).to(x.dtype)
 
+    @where_held("GlobalValue", _held)
     def gradient(self, x: Tensor) -> Tensor:
         """g_j + H_j d of the model that the best candidate starts at: (..., n) -> (..., n)."""
         trailing("GlobalValue.gradient", "x", x, 1, self.problem.dim)
         rows = x.reshape(-1, x.shape[-1]).to(self.plans.dtype)
         return self.model(rows).slope(self.problem, rows).reshape(x.shape).to(x.dtype)
 
+    @where_held("GlobalValue", _held)
     def model(self, x: Tensor) -> LocalModel:
         """The remembered model that the best candidate starts from, at every state: (B, n)."""
         entry, n = self.choose(x).entry, self.problem.dim
         state, value, gradient, curvature = self.models[entry].split((n, 1, n, n * n), dim=-1)
         return LocalModel(state, value.squeeze(-1), gradient, curvature.unflatten(-1, (n, n)))
 
+    @where_held("GlobalValue", _held)
     def bellman_residual(self, x: Tensor) -> Tensor:
         """(min_u [l(x, u) + V(F(x, u))] - V(x)) / V(x) over the policy's u and the corners of the bounds.
 
@@ -210,6 +230,7 @@ class GlobalValue(KeptPrecision):
             best = torch.minimum(best, paid + self.value(after))
         return (best - found.value) / found.value
 
+    @where_held("GlobalValue", _held)
     @without_gradient("GlobalValue", "x")
     def choose(self, x: Tensor, without: Tensor | None = None) -> Choice:
         """The best candidate at every state.
@@ -227,17 +248,17 @@ class GlobalValue(KeptPrecision):
     def nearest(self, x: Tensor, without: Tensor | None = None) -> Tensor:
         """Rows of the memory nearest to x (B, n), and last the resting one: (B, K + 1) int64."""
         count = self.candidates if without is None else min(4 * self.candidates, len(self._rows))
-        seen = self.seen(x).numpy()
+        seen = self.seen(x).cpu().numpy()  # the tree is the processor's
         if not np.isfinite(seen).all():
             seen = np.where(np.isfinite(seen), seen, 0.0)  # such a row finds no value, the others theirs
         at = self._tree.query(seen, count)[1].reshape(len(x), -1)
         rows = self._rows.numpy()[at]
         if without is not None:
-            own = rows // self.length == without.numpy()[:, None]
+            own = rows // self.length == without.cpu().numpy()[:, None]
             rows = np.take_along_axis(rows, own.argsort(axis=1, kind="stable"), axis=1)[:, : self.candidates]
         whole = np.empty((len(rows), rows.shape[1] + 1), dtype=np.int64)
         whole[:, :-1], whole[:, -1] = rows, self.resting
-        return torch.from_numpy(whole)
+        return torch.from_numpy(whole).to(x.device)
 
     def follow(self, x: Tensor, entries: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Cost (B, K), first control (B, K, m) and arrival (B, K) of candidates (B, K) at x (B, n)."""
@@ -263,6 +284,7 @@ class GlobalValue(KeptPrecision):
         """Follow candidates, as a step of a program."""
         return carry, follow_plan(self.problem, self.region, self.worst, *row)
 
+    @where_held("GlobalValue", _held)
     def replay(self, x: Tensor, entries: Tensor, steps: int) -> tuple[Tensor, Reference]:
         """The stored control (B, T, m) to follow from x (B, n), and what it is a feedback around.
 
@@ -272,7 +294,7 @@ class GlobalValue(KeptPrecision):
             steps: T.
         """
         time = entries % self.length
-        ahead = (time.unsqueeze(1) + torch.arange(steps, device="cpu")).clamp(max=self.length - 1)
+        ahead = (time.unsqueeze(1) + torch.arange(steps, device=x.device)).clamp(max=self.length - 1)
         state, control, feedback = unpacked(self.problem, self.plans[(entries - time).unsqueeze(1) + ahead])
         shift = x - self.problem.offset(x, state[:, 0]) - state[:, 0]
         return control, Reference(state + shift.unsqueeze(1), feedback)

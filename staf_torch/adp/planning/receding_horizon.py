@@ -15,9 +15,10 @@ from ...lanes.gradients import without_gradient
 from ...lanes.row_decisions import numbers_of_rows
 from ...lanes.row_numbers import over_rows, some_rows
 from ...numerics.checks import fail, flag, integer, trailing
+from ...numerics.default_device import where_held
 from ..loop.controller import Controller
 from ..policies.sampled_rollout import SampledRollout
-from ..problem.sampled import SampledProblem
+from ..problem.sampled import SampledProblem, goal_of
 from .ddp import BoxDDP
 from .global_value import GlobalValue
 from .global_value_learning import best_from
@@ -122,6 +123,7 @@ class RecedingHorizon(Controller):
         if self._compile and self._search is not None and self.memory is None:
             self._improved.hasten()
 
+    @where_held("RecedingHorizon.init", goal_of)
     @without_gradient("RecedingHorizon.init", "x0", "self")
     def init(self, x0: Tensor) -> Following:
         """The first plan, from the states x0 (B, n)."""
@@ -134,11 +136,13 @@ class RecedingHorizon(Controller):
         found = self._first.solve(x0, control, reference, self._terminal(x0, control, reference))
         return _following(found)
 
+    @where_held("RecedingHorizon.idle", goal_of)
     def idle(self, x0: Tensor) -> Following:
         """The linear feedback of the goal as a plan, not yet followed from the states x0 (B, n)."""
         plan = over_rows(lambda x: resting(self.problem, self.problem.goals(x, self.steps)[:, :-1]), x0)
         return Following(plan, torch.zeros_like(plan[:, 0, 0]))
 
+    @where_held("RecedingHorizon.step", goal_of)
     @without_gradient("RecedingHorizon.step", "x", "self")
     def step(self, x: Tensor, carried: Following, uniform: Tensor, dt: float) -> tuple[Tensor, Following]:
         """The first control of the improved plan (B, m), and the plan a step further on."""

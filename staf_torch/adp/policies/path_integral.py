@@ -11,9 +11,9 @@ from torch import Tensor
 from ...lanes import Program, scan
 from ...lanes.tree import Tree
 from ...numerics.checks import fail, integer, one_or_each, positive, positive_real, trailing
-from ...numerics.default_device import device_of
+from ...numerics.default_device import device_of, where_held
 from ..loop.controller import Controller
-from ..problem.sampled import SampledProblem
+from ..problem.sampled import SampledProblem, goal_of
 
 _OUTSIDE = 1e-12  # share of a uniform number that is left away: its normal one is then finite
 _NOISE = 0.5  # standard deviation, of the range of an input
@@ -100,11 +100,13 @@ class PathIntegral(Controller):
         self.draws = -(-self.samples * self.knots * m // n)
         self._roll = Program(self._rolled, name="sampled plans", compile=compile)
 
+    @where_held("PathIntegral.init", goal_of)
     def init(self, x0: Tensor) -> Tensor:
         """No change of the feedback, (B, T, m)."""
         trailing(type(self).__name__, "x0", x0, 2)
         return x0.new_zeros(len(x0), self.steps, self.problem.inputs, dtype=self.noise.dtype)
 
+    @where_held("PathIntegral.step", goal_of)
     def step(self, x: Tensor, carried: Tensor, uniform: Tensor, dt: float) -> tuple[Tensor, Tensor]:
         """The first control of the improved plan (B, m), and the change a step further on."""
         given = trailing("PathIntegral.step", "x", x, 2, self.problem.dim).dtype
@@ -132,6 +134,7 @@ class PathIntegral(Controller):
         ahead = torch.cat((plan[:, 1:], torch.zeros_like(plan[:, :1])), dim=1)
         return self.problem.steered(x, plan[:, 0]).to(given), ahead
 
+    @where_held("PathIntegral.costs", goal_of)
     def costs(self, x: Tensor, change: Tensor) -> Tensor:
         """Return the costs of changes of the feedback, inf if not finite: (B, n), (B, S, T, m) -> (B, S)."""
         cost = self._roll.over((change,), (x,))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -368,6 +368,12 @@ class SampledProblem(nn.Module, metaclass=OfRows):
             ) from error
         clock = self.dim - n
         return pad(p, (0, clock, 0, clock)), pad(k, (0, clock))
+
+
+def goal_of(planner: Any) -> Tensor:
+    """Return a tensor of a planner's problem, which is where the planner computes."""
+    goal: Tensor = planner.problem.goal
+    return goal
 
 
 def _held(plant: Plant, cost: Cost, h: float, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
