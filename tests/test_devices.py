@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import torch
 from helpers_experiments import run, words
+from helpers_swingup import double_integrator
 from pretend_device import DEVICE, Elsewhere
 from torch import Tensor
 from variants import ACTOR_CRITIC_LAWS, KERNELS, LAWS, PLANTS, PREDICTORS, VALUE_BASES, by_turns, over
@@ -26,7 +27,7 @@ def there(tensor: Tensor) -> Tensor:
 
 def agree(found: Tensor, wanted: Tensor) -> None:
     assert isinstance(found, Elsewhere)
-    torch.testing.assert_close(found.cpu(), wanted, rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(found.cpu(), wanted, rtol=1e-9, atol=1e-12, equal_nan=True)
 
 
 def test_a_device_that_is_pretended_refuses_tensors_of_the_cpu() -> None:
@@ -152,3 +153,43 @@ def test_what_was_made_on_the_cpu_serves_states_that_are_elsewhere() -> None:
     with lanes.compiling("never"):
         for there_, here in zip(found(there(X0)), found(X0), strict=True):
             agree(there_, here)
+
+
+def test_planners_and_memories_that_were_made_on_the_cpu_take_states_of_a_device(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    problem = double_integrator(-1.0, 1.0)
+    memory = adp.GlobalValue(problem, adp.BoxDDP(problem, steps=30, compile=False).solve(X0), [3.0, 3.0])
+    plans = adp.RecedingHorizon(problem, steps=3, memory=memory, compile=False)
+    sampled = adp.PathIntegral(problem, steps=3, knots=2, samples=4, compile=False)
+    moved = copy.deepcopy(memory).to(DEVICE)
+
+    def planned(x: Tensor) -> list[Tensor]:
+        drawn = 0.5 * torch.ones(len(x), sampled.draws, 2, dtype=x.dtype, device=x.device)
+        found = [each.step(x, each.init(x), drawn, 0.1)[0] for each in (plans, sampled)]
+        held = memory if x.device.type == "cpu" else moved
+        return [*found, memory(x[:1]), memory.value(x), held(x), held.gradient(x), held.bellman_residual(x)]
+
+    for one, other in zip(planned(there(X0)), planned(X0), strict=True):
+        agree(one, other)
+    assert "`.to('lazy:0')` before compute there" in caplog.text
+
+
+def test_a_memory_of_local_models_is_where_the_first_of_them_was() -> None:
+    basis = st.StaFBasis(st.GaussianKernel(), st.StateFollowingCenters(st.rings(6), 0.1))
+
+    def filled(x: Tensor) -> st.ExperienceMemory:
+        memory = st.ExperienceMemory(basis, 2)
+        for point in x:
+            memory.add(point, basis.local(point).fit(basis.values(point, targets.Paper())))
+        return memory
+
+    x = torch.cat((X0, 2 * X0[:1], X0[:1] + 0.07))
+    one, other = filled(there(x)), filled(x)
+    agree(one(there(x)), other(x))
+    agree(one.start(there(x)), other.start(x))
+    agree(one.gradient(there(x)), other.gradient(x))
+    with pytest.raises(ValueError, match=r"`ExperienceMemory.query\(y=...\)` must be on lazy:0"):
+        one(x)
+    with pytest.raises(ValueError, match=r"`ExperienceMemory.add\(x=...\)` must be on cpu"):
+        other.add(there(x[0]), there(torch.zeros(6, dtype=torch.float64)))

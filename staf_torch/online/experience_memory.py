@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NoReturn
 
 import torch
 from torch import Tensor, nn
@@ -107,10 +108,12 @@ class ExperienceMemory(nn.Module):
     def add(self, x: Tensor, coefficients: Tensor) -> ExperienceMemory:
         """Store the models at the states x (..., n) with the coefficients (..., M), one a batch entry.
 
-        An entry whose state or coefficients are not finite stores nothing.
+        An entry whose state or coefficients are not finite stores nothing. The first ones take the memory to
+        where they are.
 
         Raises:
-            ValueError: if a shape is not (*batch_shape, n) or (*batch_shape, M), or a gradient is required.
+            ValueError: if a shape is not (*batch_shape, n) or (*batch_shape, M), a gradient is required, or
+                models are on another device than those that are stored.
         """
         batch = self.stored.shape[:-1]
         for name, value, last in (("x", x, self.basis.dim), ("coefficients", coefficients, self.basis.count)):
@@ -120,6 +123,11 @@ class ExperienceMemory(nn.Module):
                     f"got {tuple(value.shape)}."
                 )
         refuse_gradient("ExperienceMemory.add", x=x, coefficients=coefficients)
+        if x.device != self.states.device:
+            if bool((self.latest >= 0).any()):
+                self._refuse_elsewhere("add", "x", x)
+            for name, held in self.named_buffers(recurse=False):
+                setattr(self, name, held.to(x.device))
         self._lock.write(self._add, x, coefficients)
         return self
 
@@ -184,8 +192,14 @@ class ExperienceMemory(nn.Module):
         found = self.basis.local(x).fit(values)
         return torch.where(self.covered(x).unsqueeze(-1), found, torch.nan)
 
+    def _refuse_elsewhere(self, call: str, name: str, value: Tensor) -> NoReturn:
+        rule = f"must be on {self.states.device}, where the memory is: move one of them by `.to`"
+        raise ValueError(f"`ExperienceMemory.{call}({name}=...)` {rule}; got one on {value.device}.")
+
     def _asked(self, function: Callable[[Tensor], Tensor], y: Tensor) -> Tensor:
         """Return function(y) while no model is stored."""
+        if y.device != self.states.device:
+            self._refuse_elsewhere("query", "y", y)
         return function(y) if torch.compiler.is_compiling() else self._lock.read(function, y)
 
     def _relative(self, y: Tensor) -> Tensor:
