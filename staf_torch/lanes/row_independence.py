@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 
 from .given import Given
 from .loops import few_passes
@@ -24,6 +25,7 @@ from .row_numbers import over_rows, some_rows
 from .tree import Shared, Tree, flatten, plain, unflatten
 
 _BITS = (1, -1, 3, -5, 17)  # units in the last place by which inputs are moved
+_NEARBY = (0.1, 1e-3)  # of an input and of 1: points beside those that are given
 _CLOSE = 1e-2  # of the largest entry: far above what another order of sums does to an ill-conditioned row
 
 
@@ -55,7 +57,9 @@ def doubt(step: Callable[..., Any], given: Given, *, again: bool = True) -> str 
             return f"takes one row but not two: {type(error).__name__}: {error}"
         for row, at in ((first, 0), (other, 1)):
             found = alone if row == first else _called(step, given, [row])
-            if not _alike(step, given, row, found, [leaf[at : at + 1] for leaf in both]):
+            beside = [leaf[at : at + 1] for leaf in both]
+            differ = _differing(step, given, row, found, beside)
+            if differ and not _cancelled(step, given, [first, other], at, differ, found, beside):
                 return (
                     "gives a row other numbers beside another row "
                     "(a mean over the batch, a branch on its size?)"
@@ -63,25 +67,87 @@ def doubt(step: Callable[..., Any], given: Given, *, again: bool = True) -> str 
     return None
 
 
-def _alike(
+def _differing(
     step: Callable[..., Any], given: Given, row: int, alone: Sequence[Tensor], beside: Sequence[Tensor]
-) -> bool:
-    """Return whether a row alone equals that beside another, as far as rounding lets numbers mean anything.
+) -> list[int]:
+    """Return which leaves of a row alone are not those beside another, as far as rounding lets them mean
+    anything.
 
     One row and two are not summed in the same order. What then changes by more than a hundredth, a matrix
     that is singular to rounding, changes with the last bits of the inputs, too, and says nothing.
     """
     if len(alone) != len(beside):
-        return False
+        return [*range(max(len(alone), len(beside)))]
     differ = [
         k for k, pair in enumerate(zip(alone, beside, strict=True)) if not _leaves_are_close(*pair, _CLOSE)
     ]
     for bits in _BITS:
         if not differ:
-            return True
+            break
         moved = _called(step, given, [row], bits)
         differ = [k for k in differ if _leaves_are_close(alone[k], moved[k], _CLOSE)]
-    return not differ
+    return differ
+
+
+def _cancelled(
+    step: Callable[..., Any],
+    given: Given,
+    rows: Sequence[int],
+    at: int,
+    differ: Sequence[int],
+    alone: Sequence[Tensor],
+    beside: Sequence[Tensor],
+) -> bool:
+    """Return whether leaves of a row differ as they are zero but for rounding, which no last bit of a zero
+    moves: a variance at a point that is known.
+
+    They differ by less than half the digits of what the step computes with, and not at all at points nearby.
+    What looks at other rows does so there, too.
+    """
+    if len(alone) != len(beside):
+        return False
+    with _Largest() as seen:
+        _called(step, given, [rows[at]])
+    for k in differ:
+        if alone[k].shape != beside[k].shape or not alone[k].is_floating_point():
+            return False
+        change = float((alone[k] - beside[k]).abs().nan_to_num(0.0).max())
+        if change > torch.finfo(alone[k].dtype).eps ** 0.5 * seen.size:
+            return False
+    rest = [*differ]
+    for share in _NEARBY:
+        try:
+            one = _called(step, given, [rows[at]], share=share)
+            both = [leaf[at : at + 1] for leaf in _called(step, given, rows, share=share)]
+        except RepaysError:  # the loop around it takes longer than a compiler
+            raise
+        except Exception:  # the step takes no such inputs
+            continue
+        pairs = {k: (one[k], both[k]) for k in rest if len(one) == len(both) == len(alone)}
+        near = {
+            k for k, pair in pairs.items() if _leaves_are_close(*pair, _CLOSE) and pair[0].isfinite().any()
+        }
+        rest = [k for k in rest if k not in near]
+    return not rest
+
+
+class _Largest(TorchFunctionMode):
+    """Context: the size of the largest number that torch computes inside of it."""
+
+    size = 0.0
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        out = func(*args, **(kwargs or {}))
+        for part in (out,) if isinstance(out, Tensor) else out if type(out) in (tuple, list) else ():
+            while isinstance(part, Tensor) and torch._C._functorch.is_functorch_wrapped_tensor(part):
+                part = torch._C._functorch.get_unwrapped(part)
+            if isinstance(part, Tensor) and part.is_floating_point() and part.numel():
+                with torch._C.DisableTorchFunction():
+                    size = float(part.detach().abs().nan_to_num(0.0, 0.0, 0.0).max())
+                self.size = max(self.size, size)
+        return out
 
 
 @contextmanager
@@ -121,21 +187,28 @@ def _farthest(given: Given) -> int:
     return int(distance.argmax()) if given.rows > 1 else 0
 
 
-def _called(step: Callable[..., Any], given: Given, rows: Sequence[int], bits: int = 0) -> list[Tensor]:
+def _called(
+    step: Callable[..., Any], given: Given, rows: Sequence[int], bits: int = 0, share: float = 0.0
+) -> list[Tensor]:
     """All leaves of what a step makes of some rows at the first time; the inputs are copies.
 
-    ``bits`` are units in the last place by which all numbers are moved.
+    ``bits`` are units in the last place by which all numbers are moved, ``share`` is of their size and of 1.
     """
 
     def few(leaf: Any, time: bool) -> Any:
         if isinstance(leaf, Shared):
-            return Shared(moved(leaf.tensor[0] if time else plain(leaf)).clone())
-        return moved((leaf[:, 0] if time else leaf)[rows])
+            shared = leaf.tensor[0] if time else plain(leaf)
+            return Shared(moved(shared, shared.shape).clone())
+        some = (leaf[:, 0] if time else leaf)[rows]
+        return moved(some, some.shape[1:])
 
-    def moved(leaf: Tensor) -> Tensor:
-        if not bits or not leaf.is_floating_point():
+    def moved(leaf: Tensor, shape: torch.Size) -> Tensor:
+        if not leaf.is_floating_point():
             return leaf
-        return leaf * (1 + bits * torch.finfo(leaf.dtype).eps)
+        if share:  # all rows by as much
+            way = torch.arange(1, shape.numel() + 1, device=leaf.device).cos().view(shape).to(leaf)
+            return leaf + share * (1 + leaf.abs()) * way
+        return leaf * (1 + bits * torch.finfo(leaf.dtype).eps) if bits else leaf
 
     carry, now, row = (
         given.tree(name, [few(leaf, name == "now") for leaf in getattr(given, name)])

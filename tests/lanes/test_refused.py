@@ -161,6 +161,39 @@ def test_what_rounding_decides_says_nothing_of_a_row(mixed: bool) -> None:
     assert Program(step).compiles(x, steps=2) is not mixed
 
 
+def test_what_is_zero_but_for_rounding_at_a_point_is_tried_beside_it(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    known = torch.cat(
+        (torch.zeros(1, 2).double(), torch.linspace(-1, 2, 48, dtype=torch.float64).view(24, 2).sin())
+    )
+    known[:, 1] += torch.arange(25) / 9
+    gram = (-0.5 * torch.cdist(known, known).square()).exp() + 1e-10 * torch.eye(25).double()
+    inverse, x0 = torch.linalg.inv(gram), torch.zeros(3, 2, dtype=torch.float64)
+
+    def variance(x: Tensor) -> Tensor:
+        k = (-0.5 * (x.unsqueeze(-2) - known).square().sum(-1)).exp()
+        return 1 - (k @ inverse * k).sum(-1)  # at x = 0 two rows are summed in another order than one
+
+    def hidden(x: Tensor) -> Tensor:  # beside a number that would hide it
+        return variance(x) + x.mean() + torch.maximum(x, torch.full_like(x, -1e30)).sum(-1)
+
+    x1 = torch.cat((x0[:1], 0.1 * torch.eye(2, dtype=torch.float64)))
+    for name, function, x, compiles in (
+        ("a variance", variance, x0, True),
+        ("a variance", variance, x1, True),
+        ("a hidden mean", hidden, x1, False),
+        (
+            "zero among rows",
+            lambda x: variance(x) + (x == 0).all(-1).any() * x.new_ones(()) * len(x),
+            x1,
+            False,
+        ),
+    ):
+        assert Program(lambda c, _, __, f=function: (c, f(c)), name=name).compiles(x, steps=1) is compiles
+        assert ("beside another row" in caplog.text) is not compiles
+
+
 def test_loops_are_tried_by_a_few_passes_and_all_calls_are_seen(caplog: pytest.LogCaptureFixture) -> None:
     """What a user's function does with its rows, every pass does."""
     calls = list[int]()
