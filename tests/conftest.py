@@ -32,6 +32,8 @@ UNOPTIMISED = {"adp", "deploy", "engine", "lanes"}
 """Rooms whose programs are built in a third of the time, but where bits, rounding or speed are the matter."""
 AS_FOR_USERS = ("bit", "test_compiled_is_the_definition", "within_their_bounds")
 
+logging.getLogger("staf_torch.lanes.short_calls").setLevel("ERROR")  # the suite is many short calls
+
 hypothesis.settings.register_profile("suite", max_examples=25, deadline=None, derandomize=True)
 hypothesis.settings.load_profile("suite")
 

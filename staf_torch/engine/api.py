@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable, Iterator
 from dataclasses import fields
 from typing import Any
@@ -14,7 +15,9 @@ from ..lanes import Program, Shared
 from ..lanes.device.chunks import beside_history, joined
 from ..lanes.opaque import opaque
 from ..lanes.row_numbers import over_rows
+from ..lanes.short_calls import ShortCall
 from ..lanes.tree import plain
+from ..lanes.when_compiled import undecided
 from ..optim.base import UpdateLaw
 from ..signs import Sign
 from . import row_program
@@ -212,6 +215,7 @@ class _ChaseRun:
         self._first = row_program.first_carry(problem, self.carry)
         self._unit = self._first.unit  # of the last chunk, bit by bit: a row that diverged stays as it was
         self.program = row_program.program(problem, states, self._first, everything=everything)
+        self._few = states.shape[1] < row_program.SHORTEST
         self._warns = row_program.settings_of(problem, states, everything)[-1]
 
     def chunks(self, states: Tensor) -> tuple[Tensor, ...]:
@@ -235,7 +239,8 @@ class _ChaseRun:
             run, _ = self._corrected(known, carry)
             return run.after * (-kept_gain(known.log_gain, run.carry)).exp().unsqueeze(-1), run.carry
 
-        found, self.carry = over_rows(defined, states, self.carry)
+        with self._short():
+            found, self.carry = over_rows(defined, states, self.carry)
         return found
 
     def results(self, states: Tensor) -> ChaseResult:
@@ -251,8 +256,16 @@ class _ChaseRun:
             result, carry = self._defined(states, carry)
             return {each.name: getattr(result, each.name) for each in fields(result)}, carry
 
-        every, self.carry = over_rows(defined, states, self.carry)
+        with self._short():
+            every, self.carry = over_rows(defined, states, self.carry)
         return ChaseResult(**every)
+
+    def _short(self) -> contextlib.AbstractContextManager[None]:
+        """Return what counts a call whose few times alone leave it in plain torch."""
+        if self.program is not None or not self._few or not undecided():
+            return contextlib.nullcontext()
+        problem = self._problem
+        return ShortCall("the chase", tuple(map(type, (problem.basis.kernel, problem.law, problem.target))))
 
     def _defined(self, states: Tensor, carry: Carry) -> tuple[ChaseResult, Carry]:
         """Return everything at the states (B, C, n) by the definition, and the carry after them."""

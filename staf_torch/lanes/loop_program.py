@@ -14,6 +14,7 @@ from .plain_time import PlainTime, RepaysError
 from .program import Program
 from .row_independence import generators
 from .row_numbers import one_by_one
+from .short_calls import ShortCall
 from .tree import Tree
 
 _log = logging.getLogger(__name__)
@@ -52,6 +53,7 @@ class LoopProgram:
         self._done, self._spent, self._fastest, self._said = 0, 0.0, math.inf, False
         self._parts, self._waited = parts, False
         self._counted = 0  # rows, one after the other, of which a step was counted
+        self._short = ShortCall(plain.name, tuple(map(type, parts)), "`compile=True`" if remedy else "")
 
     def __call__(
         self, carry: Tree, now: Tree = (), row: Tree = (), *, steps: int | None = None, every: int = 1
@@ -60,13 +62,20 @@ class LoopProgram:
         if self._compiled is None:
             put_back = generators()
             try:
-                with self._sign:
-                    return self._plain(carry, now, row, steps=steps, every=every)
+                return self._in_plain_torch(carry, now, row, steps=steps, every=every)
             except RepaysError:
                 assert self._make is not None
                 put_back()
                 self._compiled = self._make()
         return self._compiled(carry, now, row, steps=steps, every=every)
+
+    def _in_plain_torch(self, *given: Tree, steps: int | None, every: int) -> tuple[Tree, Tree]:
+        calls, before = int(not self._done), self._spent
+        with self._sign:
+            found = self._plain(*given, steps=steps, every=every)
+        if self._make is not None and not self._said:
+            self._short.count(self._spent - before, calls)
+        return found
 
     def _timed(self, carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
         start = time.perf_counter()

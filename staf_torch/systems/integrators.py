@@ -149,7 +149,7 @@ def _stepped(
     if capturing(x):
         return Program(tracked(system, dt, count), name="a trajectory", compile=False)
     plain = Program(untracked, name="a trajectory", compile=False)
-    return LoopProgram(plain, compiled, times) if undecided() else plain
+    return LoopProgram(plain, compiled, times, parts=(system,)) if undecided() else plain
 
 
 def _advanced(system: ControlAffineSystem, x: Tensor, dt: float, count: int) -> tuple[Tensor, Tensor]:

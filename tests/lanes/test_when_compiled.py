@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import re
 import time
 
 import numpy as np
@@ -9,7 +11,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from staf_torch import adp, lanes, systems
+import staf_torch as st
+from staf_torch import adp, lanes, optim, systems, targets
 
 pytestmark = pytest.mark.needs_compiler
 COST = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
@@ -105,6 +108,38 @@ def test_a_function_is_compiled_once_its_calls_took_as_long_as_a_compiler(
         function(X0)
         calls += 1
     assert least <= calls <= most
+
+
+class Swing(systems.Pendulum):
+    """A plant of a kind of its own: short calls are counted by kind."""
+
+
+STATES = torch.rand(2, 5, 2, dtype=torch.float64)
+BASIS = st.StaFBasis(st.GaussianKernel(), st.StateFollowingCenters(st.rings(3), 0.1))
+SHORT = {
+    "the closed loop": (
+        lambda: adp.simulate(lambda x: -x[..., 1:], Swing(), COST, X0, dt=0.01, steps=20),
+        0.02,
+    ),
+    "a trajectory": (lambda: systems.simulate(Swing(), X0, dt=0.01, steps=20), 0.02),
+    "the chase": (lambda: st.chase_weights(STATES, BASIS, targets.Paper(), optim.FixedStep(0.01)), 0.4),
+}
+
+
+@pytest.mark.parametrize("name", SHORT)
+def test_short_calls_that_are_asked_again_and_again_say_once_what_they_cost(
+    name: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    caplog.set_level("WARNING", logger="staf_torch.lanes.short_calls")
+    call, tick = SHORT[name]
+    clock = itertools.count()
+    monkeypatch.setattr(time, "perf_counter", lambda: tick * next(clock))
+    with lanes.compiling("auto"):
+        for _ in range(9):
+            call()
+    (line,) = [text for text in caplog.messages if "plain torch" in text]
+    assert re.match(rf"{name}: 8 calls took 3.\d s in plain torch, 4\d\d ms each: each is too short", line)
+    assert ("`compile=True` or `with lanes" in line) is (name == "the closed loop")
 
 
 def test_a_slow_plant_that_is_no_torch_says_within_two_seconds_how_long_it_takes(
