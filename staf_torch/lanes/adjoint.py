@@ -199,7 +199,9 @@ class GradientCall:
             plan.into(rooms, leaves, again)
             return [*rooms]
         found, carries = plan(leaves), len(given.carry)
-        return found if where is True or not back else [*found[:carries], *map(flipped, found[carries:])]
+        return (
+            found if where is True or not back else [*found[:carries], *(x.flip(1) for x in found[carries:])]
+        )
 
     def again(self, built: Built, given: Given, own: Sequence[Tensor], to: Sequence[int]) -> Any:
         """Return what makes inputs of the adjoint while that runs, on the CPU.
@@ -225,20 +227,21 @@ class GradientCall:
         rooms: Sequence[Tensor],
     ) -> tuple[Plan, list[Any]]:
         """Return the prepared call of a program, and the inputs in its order."""
-        nows = given.now if where is True or not back else [flipped(leaf) for leaf in given.now]
-        leaves = [*given.row, *own, *nows, *given.carry]
+        leaves = [*given.row, *own, *given.now, *given.carry]
         forms = tuple([(x.shape, x.stride(), x.dtype) for x in map(plain, leaves)])
         key = id(built.trace), forms, given.times, every, tuple([room.stride() for room in rooms])
         compiled, plan = self._plans.get(key, (None, None))
         if plan is None or compiled is not built.compiled:
             if len(self._plans) >= _PLANS:
                 self._plans.clear()
-            timed = [*[False] * (len(given.row) + len(own)), *[True] * len(nows), *[False] * len(given.carry)]
+            once = len(given.row) + len(own)
+            timed = [*[False] * once, *[True] * len(given.now), *[False] * len(given.carry)]
             alone, sizes = built.compiled._replace(rows=()), {"rows": given.rows, "steps": given.times}
             if isinstance(where, bool):
                 plan = PlannedCall(alone, leaves, timed, **sizes, every=every, backwards=back, rooms=rooms)
             else:
-                plan = DeviceCall(alone, leaves, timed, **sizes, every=every, once=0, where=where, whole=True)
+                sizes |= {"every": every, "once": 0}
+                plan = DeviceCall(alone, leaves, timed, **sizes, where=where, whole=True, backwards=back)
             self._plans[key] = built.compiled, plan
         return plan, leaves
 
@@ -367,8 +370,3 @@ class _Gradient(torch.autograd.Function):
 def carried(compiled: Compiled) -> int:
     """Return the bytes of the carry of a row."""
     return sum(shape.numel() for shape, _ in compiled.carry) * compiled.real.itemsize
-
-
-def flipped(leaf: Any) -> Any:
-    """Return what times bring, (B, T, ...) or `Shared` (T, ...), from the last time to the first."""
-    return Shared(leaf.tensor.flip(0)) if isinstance(leaf, Shared) else leaf.flip(1)

@@ -79,6 +79,7 @@ class DeviceCall:
         once: how many of the leaves a row has once.
         where: the device.
         whole: whether results must be there; else what does not fit comes to the processor (`in_chunks`).
+        backwards: whether inputs of times are read from the last to the first.
 
     Attributes:
         structure: of the outputs.
@@ -101,6 +102,7 @@ class DeviceCall:
         once: int,
         where: torch.device,
         whole: bool = False,
+        backwards: bool = False,
     ) -> None:
         self._steps, self._every, self._timed, self._whole = steps, every, times, whole
         self._compiled, self.structure, self._rows, self._once = compiled, compiled.structure, rows, once
@@ -109,6 +111,9 @@ class DeviceCall:
         times = [*times[:once], *[False] * len(compiled.rows), *times[once:]]
         self._copied: list[int] = []  # inputs without one stride from entry to entry, or from elsewhere
         read = [self._input(k, *given) for k, given in enumerate(zip(leaves, times, strict=True))]
+        self._late = [(steps - 1) * time for _, time, *_ in read] if backwards else None
+        if backwards:
+            read = [(row, -time, *entries) for row, time, *entries in read]
         self.direct = not self._copied and not any(type(leaf) is Shared for leaf in leaves)
         recorded = -(-steps // every)
         self._rooms: list[Room | None] = [
@@ -147,7 +152,7 @@ class DeviceCall:
         self._pack = struct.Struct(f"{pointers}P").pack_into
         self._lock = Mutex()
 
-    def _input(self, k: int, leaf: Any, timed: bool) -> tuple[int, int, int, int]:
+    def _input(self, k: int, leaf: Any, timed: bool) -> tuple[int, ...]:
         """Strides from row to row, from time to time and from entry to entry, and how many entries."""
         shared, tensor = type(leaf) is Shared, plain(leaf)
         lead = 1 + timed - shared
@@ -186,8 +191,12 @@ class DeviceCall:
         if not rooms and self._rooms:
             return self._in_chunks(leaves)
         addresses = [0 if room is None else room.data_ptr() for room in rooms]
+        starts = [*map(_address, given)]
+        if self._late is not None:
+            late = zip(starts, given, self._late, strict=True)
+            starts = [start + x.element_size() * numbers for start, x, numbers in late]
         with self._lock:  # the driver copies the structure when it is called
-            self._pack(self._record, 0, *map(_address, given), *addresses)
+            self._pack(self._record, 0, *starts, *addresses)
             self._device.launch(self._kernel, self._record, self._rows)
         if self._table is not None and capturing(self._table):
             _of_graphs[self._table.data_ptr()] = self._table
