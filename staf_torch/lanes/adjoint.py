@@ -7,6 +7,7 @@ memory is slower than arithmetic, the backward pass computes it again (`backward
 from __future__ import annotations
 
 import contextlib
+import functools
 import re
 from collections.abc import Hashable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -16,7 +17,7 @@ from torch import Tensor
 
 from .adjoint_steps import Substituted
 from .backward import Backward
-from .call import Compiled, PlannedCall
+from .call import Compiled, PlannedCall, Where, served
 from .device.kernel import DeviceCall
 from .given import Given
 from .growth import Slope, grown, say_grown
@@ -73,6 +74,7 @@ class Ran(NamedTuple):
 
     Args:
         call: that was made.
+        where: its tensors are.
         built: of the program that keeps carries.
         order: what the step reads, in an order that all processes share.
         found: places of the captured tensors with a gradient among those that the trace found.
@@ -86,6 +88,7 @@ class Ran(NamedTuple):
     """
 
     call: GradientCall
+    where: Where
     built: Built
     order: dict[int, int]
     found: tuple[int, ...]
@@ -118,6 +121,7 @@ class GradientCall:
         self._shared = [isinstance(leaf, Shared) for leaf in (*given.row, *given.now, *given.carry)]
         self._plans: dict[Any, tuple[Compiled, Plan]] = {}
         self.followers: dict[Hashable, tuple[Program, tuple[Hashable, Any], Any]] = {}
+        self._keepers: dict[Where, tuple[Program, Hashable]] = {}  # programs, and where what is built stands
         self._refused = False
         self.adjoints = program.adjoints
 
@@ -129,11 +133,17 @@ class GradientCall:
         """
         if self._refused or not self.program.compile:
             return None
-        tensors = [plain(leaf) for leaf in leaves]
-        keeping = self.program.keeping(self.given([tensor.detach() for tensor in tensors]))
-        if keeping is None:
-            return None
-        ran = self._ran(*keeping)
+        tensors, where = [plain(leaf) for leaf in leaves], served(leaves)
+        keeping, place = self._keepers.get(where, (None, None))
+        built = None if keeping is None else keeping.latest(place)
+        if keeping is None or built is None:
+            given = self.given([tensor.detach() for tensor in tensors])
+            found = self.program.keeping(given)
+            if found is None:
+                return None
+            keeping, built = found
+            self._keepers[where] = keeping, keeping.place(given)
+        ran = self._ran(where, keeping, built)
         own = columns(ran.numbers, self.rows)
         rooms = iter(_Gradient.apply(ran, *tensors, *ran.captured, *own))  # type: ignore[no-untyped-call]
         outputs = ran.built.compiled.structure[1][0]  # beside them it has the carries
@@ -144,17 +154,17 @@ class GradientCall:
         found: set[int] = self.adjoints.setdefault(id(trace), (trace, set()))[1]
         return found
 
-    def _ran(self, keeping: Program, built: Built) -> Ran:
+    def _ran(self, where: Where, keeping: Program, built: Built) -> Ran:
         read = [keeping.in_place_of(tensor) for tensor in built.trace.recipe.found]
         found = tuple(k for k, tensor in enumerate(read) if tensor.requires_grad)
         fixed = [t for t in read if not (t.requires_grad or t.is_inference())]
-        work = re.search(r"WORK_STEP = (\d+)", built.trace.text.source)
-        size = carried(built.compiled)
-        pays = work is None or int(work[1]) > _WORTH * size
+        size, work = carried(built.compiled), _work(built.trace.text.source)
+        pays = work is None or work > _WORTH * size
         return Ran(
             call=self,
+            where=where,
             built=built,
-            order={id(tensor): k for k, tensor in enumerate(keeping.reads())},
+            order={id(tensor): k for k, tensor in enumerate(keeping.reads())} if found else {},
             found=found,
             captured=tuple(read[k] for k in found),
             read=tuple(read),
@@ -173,6 +183,7 @@ class GradientCall:
 
     def run(
         self,
+        where: Where,
         built: Built,
         given: Given,
         own: Sequence[Tensor],
@@ -185,6 +196,7 @@ class GradientCall:
         """Run a program; return what it returns.
 
         Args:
+            where: its inputs are.
             built: the program.
             given: its inputs.
             own: columns of rows' numbers.
@@ -193,7 +205,6 @@ class GradientCall:
             rooms: tensors of the program's dtype to write to, on the CPU; none where they are new.
             again: what makes inputs of times, of `again`.
         """
-        where = True if rooms else given.ordinary()
         plan, leaves = self._plan(where, built, given, own, every, back, rooms)
         if rooms and isinstance(plan, PlannedCall):
             plan.into(rooms, leaves, again)
@@ -251,9 +262,9 @@ class GradientCall:
         own = tensors[len(tensors) - len(ran.numbers) :]
         fewer = None if ran.kept else self.program.built(given)
         end = len(ran.built.compiled.outputs)  # carries and outputs, before the carries that are kept
-        if ran.kept and given.ordinary() is True:
+        if ran.kept and ran.where is True:
             return self._keeping(ran, given, own)
-        rooms = self.run(fewer or ran.built, given, own, self.every)
+        rooms = self.run(ran.where, fewer or ran.built, given, own, self.every)
         if fewer is not None:
             return rooms, []
         return rooms[:end], rooms[end:] if ran.kept else []
@@ -269,7 +280,7 @@ class GradientCall:
             empty_rows(like, rows, (times if k in ran.keeps else 1,), shape).expand(rows, times, *shape)
             for k, (shape, _) in enumerate(compiled.carry)
         ]
-        self.run(ran.built, given, own, 1, rooms=[*results, *kept])
+        self.run(True, ran.built, given, own, 1, rooms=[*results, *kept])
         dtypes = [dtype for _, dtype in (*compiled.carry, *made)]
         return [room.to(dtype) for room, dtype in zip(results, dtypes, strict=True)], kept
 
@@ -365,6 +376,13 @@ class _Gradient(torch.autograd.Function):
             return (None,) * (1 + len(needs))
         count = len(needs)
         return None, *ctx.ran.call.backward(ctx.ran, saved[:count], saved[count:], needs, ends)
+
+
+@functools.lru_cache(_PLANS)
+def _work(source: str) -> int | None:
+    """Return the operations of a step that a text tells; None for a kernel."""
+    found = re.search(r"WORK_STEP = (\d+)", source)
+    return None if found is None else int(found[1])
 
 
 def carried(compiled: Compiled) -> int:

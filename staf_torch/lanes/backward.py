@@ -19,7 +19,7 @@ from torch import Tensor
 from .adjoint_steps import Deciding, Differentiated, ReversedStep, Substituted, adjoint_step, deciding
 from .given import Given
 from .row_independence import undrawn
-from .row_sums import UNIT, AtTimes, by_units, empty_rows, halved, joined, split
+from .row_sums import UNIT, AtTimes, by_units, empty_rows, halved, joined, part, split
 from .trace.captured_tensors import TableSlopes
 from .trace.step import Step
 from .tree import Shared, flatten, plain
@@ -90,6 +90,7 @@ class Backward:
         call = ran.call
         self._ran, self._call = ran, call
         self.slopes: list[tuple[int, Tensor]] = []
+        self._zero: Tensor | None = None
         sizes = (*call.sizes, len(ran.captured), len(ran.numbers))
         given = call.given(tensors[: sum(call.sizes)])
         self._row, self._now, self._carry = given.row, given.now, given.carry
@@ -101,6 +102,7 @@ class Backward:
         self._order = tuple(ran.order[id(ran.captured[k])] for k in self._of_captured)
         self._device = plain(next(iter((*self._carry, *self._row, *self._now)))).device
         key = id(ran.built.trace), (*needs,), tuple([end is not None for end in ends]), self._order
+        self._on_processor = ran.where is True
         self.built = self._known(key)
         # Leaves of the carry that the adjoint reads: what comes at a time begins with them.
         times = () if self.built is None else self.built.trace.times
@@ -161,15 +163,13 @@ class Backward:
         call, ran, adjoint = self._call, self._ran, self._call.adjoints[key]
         self._adjoint, few = adjoint, slice(0, min(call.rows, UNIT))
         program, place, trace = call.followers.get((key, adjoint.kind), (None, None, None))
-        if program is not None and place is not None and trace is adjoint.trace:
-            self._on_processor = isinstance(place[1], int)
-            if (built := program.latest(place)) is not None:
-                return built
+        built = program.latest(place) if program is not None and trace is adjoint.trace else None
+        if built is not None:
+            return built
         begin = [leaf[few] for leaf in self._carry]
         given = self._given(few, slice(0, 1), self._slopes(few), [leaf.unsqueeze(1) for leaf in begin], None)
         program = call.program.follower(adjoint.kind, self._step, follows=ran.built.followed)
         call.followers[key, adjoint.kind] = program, program.place(given), adjoint.trace
-        self._on_processor = given.ordinary() is True
         return program.built(given)
 
     def _deciding(self) -> Deciding:
@@ -293,37 +293,45 @@ class Backward:
         """Run some rows from the last time to the first: gradients by their carry, and sums over times."""
         call = self._call
         starts = range(0, call.times, times)
-        begins = [[leaf[rows] for leaf in self._carry]]
+        begins = [[part(leaf, rows) for leaf in self._carry]]
         if len(starts) > 1:
             found = self._carries(rows, slice(0, call.times), begins[0], times)
             begins = [[leaf[:, k] for leaf in found] for k in range(len(starts))]
         slopes, sums = self._slopes(rows), None
         for start, begin in zip(reversed(starts), reversed(begins), strict=True):
             piece = slice(start, min(start + times, call.times))
-            before, again = [x[rows] for x in kept], None
+            before, again = [part(x, rows) for x in kept], None
             if not kept:
                 before, again = self._again(rows, piece, begin)
             given = self._given(rows, piece, slopes, before, sums)
-            own = [column[rows] for column in self._read]
+            own = [part(column, rows) for column in self._read]
             assert self.built is not None
             rooms = self._rooms(rows, piece, at_times)
-            found = call.run(self.built, given, own, 1, back=True, rooms=rooms, again=again)
+            found = call.run(self._ran.where, self.built, given, own, 1, back=True, rooms=rooms, again=again)
             slopes, sums, slow = split(found, (len(slopes), len(self._adjoint.sums), len(at_times.leaves)))
             at_times.put(rows, piece, slow)
         return slopes, sums or []
 
     def _slopes(self, rows: slice) -> list[Tensor]:
         """Gradients by the carry after the last time."""
-        triples = zip(self._carry, self._end, self._adjoint.form.carry, strict=True)
-        zero = torch.zeros((), dtype=self._ran.built.compiled.real, device=self._device)
-        return [zero.expand(x[rows].shape) if end is None else end[rows] for x, end, one in triples if one]
+        triples, count = (
+            zip(self._carry, self._end, self._adjoint.form.carry, strict=True),
+            rows.stop - rows.start,
+        )
+        chosen = [(x, end) for x, end, one in triples if one]
+        return [self._zeros(count, x.shape[1:]) if end is None else part(end, rows) for x, end in chosen]
+
+    def _zeros(self, count: int, shape: Sequence[int]) -> Tensor:
+        if self._zero is None:
+            self._zero = torch.zeros((), dtype=self._ran.built.compiled.real, device=self._device)
+        return self._zero.expand(count, *shape)
 
     def _carries(self, rows: slice, times: slice, begin: Sequence[Tensor], every: int) -> list[Tensor]:
         """The carry before times of some rows, computed again."""
         if not begin:
             return []
         given, own = self._once_more(rows, times, begin)
-        return self._call.run(self._ran.built, given, own, every)[-len(begin) :]
+        return self._call.run(self._ran.where, self._ran.built, given, own, every)[-len(begin) :]
 
     def _again(self, rows: slice, times: slice, begin: Sequence[Tensor]) -> tuple[list[Tensor], Any]:
         """The carry before times of some rows, and what makes it while the adjoint runs, if that is so."""
@@ -352,7 +360,7 @@ class Backward:
 
     def _some(self, leaves: Sequence[Any], rows: slice, times: slice | None) -> list[Any]:
         if times is None:
-            return [leaf if isinstance(leaf, Shared) else leaf[rows] for leaf in leaves]
+            return [leaf if isinstance(leaf, Shared) else part(leaf, rows) for leaf in leaves]
         return [Shared(x.tensor[times]) if isinstance(x, Shared) else x[rows, times] for x in leaves]
 
     def _given(
@@ -366,8 +374,7 @@ class Backward:
         """Return the inputs of the adjoint."""
         count, adjoint, structures = rows.stop - rows.start, self._adjoint, self._adjoint.structures
         if sums is None:
-            zero = torch.zeros((), dtype=self._ran.built.compiled.real, device=self._device)
-            sums = [zero.expand(count, *x.shape) for x in adjoint.sums]
+            sums = [self._zeros(count, x.shape) for x in adjoint.sums]
         ends = [self._at(end, rows, times) for end in self._ends if end is not None]
         captured, own = list[Shared](), list[Tensor]()
         if adjoint.table is None:

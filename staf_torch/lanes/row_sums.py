@@ -94,3 +94,8 @@ def split(leaves: Sequence[Any], sizes: Sequence[int]) -> list[list[Any]]:
     """Return consecutive parts of these sizes."""
     rest = iter(leaves)
     return [[next(rest) for _ in range(size)] for size in sizes]
+
+
+def part(x: Tensor, rows: slice) -> Tensor:
+    """Return some rows, the tensor itself where these are all."""
+    return x if rows.stop - rows.start == len(x) else x[rows]
