@@ -34,7 +34,7 @@ struct Frame {
     const REAL *c;
     const Slot *outputs;
     REAL *const *data;  // of the outputs
-    int rows, times, span;
+    int rows, times, span, step;  // of `now`: from number to number, from time to time
     int64_t first, time, every, recorded;
 };
 static void prepare(const Frame &f, int b);
@@ -148,23 +148,28 @@ struct Remade {
     const Again *again;  // null: none
     Slot *now, *slots;  // of this program's inputs of times, and of all of the other's
     REAL **now_data, **data;
+    bool whole = false;  // whether it is all that times bring, number after number
 
     void begin(REAL *const *from, int64_t tile) {
-        int64_t numbers = 0;
+        int64_t size = 0, other = 0;  // of a time
         for (int s = 0; s < SLOTS_NOW; ++s) now[s] = call.slots[SLOTS_ROW + s], now_data[s] = from[SLOTS_ROW + s];
         for (int64_t s = 0; s < again->inputs + again->results; ++s) slots[s] = again->call->slots[s];
+        for (int64_t k = 0; k < again->results; ++k)
+            (again->to[k] < 0 ? other : size) += slots[again->inputs + k].entries * tile;
+        REAL *to = made.of(size * call.times + other), *rest = to + size * call.times;
         for (int64_t k = 0; k < again->results; ++k) {
             Slot &slot = slots[again->inputs + k];
-            const int64_t size = slot.entries * tile, here = again->to[k];
+            const int64_t here = again->to[k];
+            REAL *&place = here < 0 ? rest : to;
+            data[again->inputs + k] = place, place += slot.entries * tile;
             slot = {1, here < 0 ? 0 : size, tile, slot.entries};
             if (here >= 0) now[here] = {1, -size, tile, slot.entries};
-            numbers += here < 0 ? size : size * call.times;
         }
-        REAL *to = made.of(numbers);
-        for (int64_t k = 0; k < again->results; ++k) {
-            data[again->inputs + k] = to;
-            to += slots[again->inputs + k].entries * tile * (again->to[k] < 0 ? 1 : call.times);
-        }
+        int64_t met = 0;
+        whole = AHEAD == 0;
+        for (int s = 0; s < SLOTS_NOW; met += now[s++].entries)
+            whole = whole && (now[s].time == -size || !READ[s]);
+        whole = whole && met * tile == size;
     }
     void run(int64_t first, int rows) {
         Call part = *again->call;
@@ -198,18 +203,22 @@ struct Work {
         Remade remade{call, call.again, made_slots, made_slots + SLOTS_NOW, made_data, made_data + SLOTS_NOW};
         if (call.again) remade.begin(data, tile), now = made_slots, now_data = made_data;
         Frame f;
-        f.fixed = memory.of(numbers + lanes), f.carry = f.fixed + (ROWS + FIXED) * room, f.now = f.carry + CARRIES * room;
+        f.fixed = memory.of(numbers + lanes), f.carry = f.fixed + (ROWS + FIXED) * room;
+        REAL *const gathered = f.carry + CARRIES * room;
         f.c = call.table, f.outputs = out + SLOTS_CARRY, f.data = out_data + SLOTS_CARRY;
-        f.every = call.every, f.span = span, f.recorded = (call.times + call.every - 1) / call.every;
+        f.every = call.every, f.recorded = (call.times + call.every - 1) / call.every;
         for (int64_t first; (first = __atomic_fetch_add(&next, tile, __ATOMIC_RELAXED)) < call.rows;) {
             f.first = first, f.rows = int(call.rows - first < tile ? call.rows - first : tile);
             if (call.again) remade.run(first, f.rows);
             gather(call.slots, data, SLOTS_ROW, first, f.rows, f.fixed);
             gather(carry, carry_data, SLOTS_CARRY, first, f.rows, f.carry);
             for (int b = 0; b < (f.rows + lanes - 1) / lanes * lanes; b += W) prepare(f, b);
+            const bool there = remade.whole && f.rows % lanes == 0;  // read where it lies
+            f.span = there ? int(now->entry) : span, f.step = there ? int(now->time) : f.rows;
             for (f.time = 0; f.time < call.times; f.time += most) {
                 f.times = int(call.times - f.time < most ? call.times - f.time : most);
-                gather_times(now, now_data, SLOTS_NOW, f, f.now);
+                f.now = there ? now_data[0] + f.first + f.time * now->time : gathered;
+                if (!there) gather_times(now, now_data, SLOTS_NOW, f, f.now);
                 ahead(f);
                 for (int b = 0; b < f.rows; b += lanes) advance(f, b, f.rows - b < lanes ? f.rows - b : lanes);
             }

@@ -195,7 +195,7 @@ class _CppWriter(TableWriter):
             self._line(f"{loop}{kind}{name} = {read}(f.carry + b + {place} * room + {j} * W);")
         self._line("Recorder recorder(f);")
         with self._braces("for (int t = 0; t < f.times; ++t)"):
-            self._line("const REAL *const now = f.now + t * f.rows + b;")
+            self._line("const REAL *const now = f.now + t * f.step + b;")
             self._line("(void)now;")
             self._steps(following)
             self._outputs(outputs)
