@@ -25,6 +25,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -144,7 +145,7 @@ def made(name: str, dtype: torch.dtype, rows: int) -> cases.Case:
     if name in OWN:
         return make(rows, dtype)
     case = make(most_of(counts), dtype)
-    return case._replace(inputs=first(case.inputs, rows))
+    return replace(case, inputs=first(case.inputs, rows))
 
 
 OWN = ("mass of a row's own",)  # that hold numbers for so many rows

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,7 +16,8 @@ from staf_torch.adp.loop.step import ClosedLoop
 from staf_torch.adp.loop.step import program as loop_program
 
 
-class Case(NamedTuple):
+@dataclass(frozen=True)
+class Case:
     """A call of something with rows, as a user makes it."""
 
     call: Callable[..., Any]  # of the inputs, to a tree of tensors (B, ...)
@@ -99,7 +101,7 @@ def of_loop(controller: Any, plant: Any, cost: Any, x0: Tensor, times: int, **mo
     loop = ClosedLoop(controller, plant, cost, **more).to(x0.dtype)
     drawn = 2 * torch.rand(len(x0), times, controller.draws, x0.shape[-1], dtype=x0.dtype) - 1
     case = of_program(loop_program(loop, True), loop.init(x0), drawn, {}, times=times)
-    return case._replace(to=loop.to)
+    return replace(case, to=loop.to)
 
 
 def stiff_loops(rows: int, dtype: torch.dtype) -> Case:

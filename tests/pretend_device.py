@@ -39,7 +39,10 @@ class Elsewhere(Tensor):
     def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         return computed(func, args, kwargs or {})
 
-    __torch_function__ = torch._C._disabled_torch_function_impl
+    @classmethod
+    def __torch_function__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        with torch.DisableTorchFunctionSubclass():
+            return func(*args, **(kwargs or {}))
 
 
 BESIDE = ("copy_", "_to_copy", "index", "index_put", "index_put_", "_index_put_impl_", "set_")

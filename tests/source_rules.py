@@ -11,7 +11,7 @@ _ANYWHERE = {*_MAKERS, "arange", "as_tensor", "empty_strided", "randint", "randp
 _ANYWHERE |= {"tril_indices", "triu_indices"}
 _CASTS = ("double", "to", "long", "type_as")
 _TEXT = ("read_text", "write_text")
-_DOCUMENTED = {"_asdict", "_field_defaults", "_fields", "_make", "_replace", "_exit", "_dynamo", "_inductor"}
+_DOCUMENTED = {"_asdict", "_field_defaults", "_fields", "_make", "_replace", "_exit"}
 """Of named tuples, `os` and torch: their manuals name them."""
 _PATCHES = {"setattr", "delattr", "setitem", "delitem", "patch", "object", "multiple", "dict"}
 _PRIVATE = re.compile(r"staf_torch(\.\w+)*\._[a-z]\w*")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-import os
+import multiprocessing
 import pickle
 import signal
 import threading
@@ -131,18 +131,20 @@ def test_copies_and_forks_beside_a_thread_that_learns_are_whole_and_free() -> No
             model.partial_fit(X[k % 40], Y[k % 40], lapse=1.0)
             k += 1
 
+    def learn_once() -> None:
+        signal.alarm(20)  # one that waits for a lock that nobody has ends so
+        assert model.partial_fit(X[0], Y[0], lapse=2.0).predict(X[1]).isfinite()
+
     thread = threading.Thread(target=learn)
     thread.start()
     try:
         for _ in range(5):
             for twin in (copy.deepcopy(model), pickle.loads(pickle.dumps(model))):
                 assert twin.partial_fit(X[0], Y[0]).predict(X[1]).isfinite()
-            child = os.fork()
-            if child == 0:
-                signal.alarm(20)  # one that waits for a lock that nobody has ends so
-                model.partial_fit(X[0], Y[0], lapse=2.0)
-                os._exit(0 if bool(model.predict(X[1]).isfinite()) else 1)
-            assert os.waitpid(child, 0)[1] == 0
+            child = multiprocessing.get_context("fork").Process(target=learn_once)
+            child.start()
+            child.join()
+            assert child.exitcode == 0
     finally:
         done.set()
         thread.join()

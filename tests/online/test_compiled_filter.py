@@ -118,7 +118,7 @@ def follow(kind: type, robust: float, own: bool, dtype: torch.dtype, count: int)
         definition.learn(slow, at, told, lapse)
         assert torch.equal(fast.counts, slow.counts)
         for name, found, expected in zip(
-            StateParts._fields,
+            StateParts.__annotations__,
             fast.parts(fast.table),
             slow.parts(slow.table),
             strict=True,
