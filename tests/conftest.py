@@ -28,9 +28,16 @@ TESTS = Path(__file__).parent
 COMPILED = {"adp", "deploy", "envs", "lanes", "online", "systems"}
 """Rooms whose tests leave the choice to compile to the library."""
 
-UNOPTIMISED = {"adp", "deploy", "engine", "lanes"}
-"""Rooms whose programs are built in a third of the time, but where bits, rounding or speed are the matter."""
-AS_FOR_USERS = ("bit", "test_compiled_is_the_definition", "within_their_bounds")
+LINKER = "-fuse-ld=gold" if shutil.which("ld.gold") else ""
+QUICK = f"{LINKER} -fno-asynchronous-unwind-tables -O0"
+"""Options by which programs are built in a third of the time; no number of a program depends on them."""
+OWN = os.environ.get("CXXFLAGS", "")
+os.environ["CXXFLAGS"] = f"{OWN} {QUICK}"
+
+OPTIMISED = {"engine", "lanes", "online"}
+AS_FOR_USERS = ("bit", "test_compiled_is_the_definition", "compiled_filter_is_its", "within_their_bounds")
+"""Tests of those rooms, by parts of their names, whose programs are built as users have them: bits, rounding
+or speed are the matter."""
 
 logging.getLogger("staf_torch.lanes.short_calls").setLevel("ERROR")  # the suite is many short calls
 
@@ -120,8 +127,8 @@ def _alike_in_every_order(
     logging.root.setLevel(logging.WARNING)  # a command that a test ran in this process has set it
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)  # `main` sets it for Hydra
     room = request.path.relative_to(TESTS).parts[0]
-    if room in UNOPTIMISED and not any(words in request.node.name for words in AS_FOR_USERS):
-        monkeypatch.setenv("CXXFLAGS", f"{os.environ.get('CXXFLAGS', '')} -O0")
+    if room in OPTIMISED and any(words in request.node.name for words in AS_FOR_USERS):
+        monkeypatch.setenv("CXXFLAGS", OWN)
     if room in ("adp", "deploy") and quick_cc is not None:
         monkeypatch.setenv("CC", str(quick_cc))
     compiled = room in COMPILED or request.node.get_closest_marker("compiled") is not None
@@ -131,12 +138,12 @@ def _alike_in_every_order(
 
 @pytest.fixture(scope="session")
 def quick_cc(tmp_path_factory: pytest.TempPathFactory) -> Path | None:
-    """The C compiler, without optimisation."""
+    """The C compiler, by `QUICK`."""
     compiler = next(filter(None, map(shutil.which, ("cc", "gcc", "g++", "clang"))), None)
     if compiler is None:
         return None
     path = Path(tmp_path_factory.mktemp("compiler") / "quick-cc")
-    path.write_text(f'#!/bin/sh\nexec {compiler} "$@" -O0\n')
+    path.write_text(f'#!/bin/sh\nexec {compiler} "$@" {QUICK}\n')
     path.chmod(0o755)
     return path
 

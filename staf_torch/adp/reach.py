@@ -95,7 +95,7 @@ def reach_of_rows(ways: list[tuple[Tensor, Reach]], count: int) -> Reach:
 
 
 class Looked(NamedTuple):
-    """How far a base leads from a sample of the box."""
+    """Measures how far a base leads from a sample of the box."""
 
     reach: Reach | None  # None where a global value is wanted
     base: Followed

@@ -1,4 +1,4 @@
-"""What commands print, also to a reader that stops early."""
+"""Prints what commands say, also to a reader that stops early."""
 
 from __future__ import annotations
 

@@ -91,7 +91,7 @@ def export_c(
 
 
 def _warned(source: Source, path: Path, ahead: bool) -> Source:
-    """What a header costs; with a line in the log where a filter in it follows its policy ahead."""
+    """Return what a header costs; with a line in the log where a filter in it follows its policy ahead."""
     if ahead:
         _log.warning(
             "%s has a filter that follows its policy ahead at some states: a call there can take all of its "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -130,13 +130,50 @@ def _run(
     """
     first, basis = members[0].problem, parts.basis
     times, starts = first.steps + 1, torch.cat([member.problem.initial_states for member in members])
+    metrics = _metrics(members, parts, rows, errors)
+    tell = _of_whole_problems(advance, len(starts), len(members))
+    blocks, chunk = _pieces(
+        starts, times, basis, jobs=len(members), kept=any(member.sink is not None for member in members)
+    )
+    told = alone and len(blocks) == 1  # the engine warns of the reach, else each member of its own
+    done, reaches = 0, list[Tensor]()  # largest |x| nu(x) of the rows of each block
+    with torch.no_grad(), warnings.catch_warnings():
+        if not told:
+            warnings.filterwarnings("ignore", message=REACH)
+        for block in blocks:
+            reach, time = torch.zeros(len(block), dtype=starts.dtype, device=starts.device), 0
+            if done:
+                metrics.next_rows()
+            with rows.of(slice(done, done + len(block))):
+                for result in _chased(first, parts, block, chunk):
+                    metrics.add(result)
+                    if not told:
+                        reach = torch.maximum(reach, _reach(basis, result.state))
+                    _distribute(result, done, time, members)
+                    time += result.state.shape[1]
+                    tell(result.state.shape[0] * result.state.shape[1])
+                    del result  # before the next one is made
+            done += len(block)
+            reaches.append(reach)
+    reach = torch.cat(reaches)
+    if alone and not told:
+        basis.warn_reach(float(reach.max()), stacklevel=2)
+    found = zip(members, metrics.summaries(), reach.split([member.rows for member in members]), strict=True)
+    return [member.outcome(summary, float(own.max()), alone=alone) for member, summary, own in found]
+
+
+def _metrics(
+    members: Sequence[_BatchMember], parts: _Objects, rows: RowsOfJobs, errors: StateErrorPass | None
+) -> ChaseMetrics:
+    """Metrics of problems that are one batch; arguments are those of `_run`."""
+    first = members[0].problem
     windows = [Member(m.rows, m.problem.dt, m.problem.settle_time) for m in members]
     if rows.differ or errors is None:
-        states = sum(window.rows * max(0, times - window.first) for window in windows)
+        states = sum(window.rows * max(0, first.steps + 1 - window.first) for window in windows)
         slower = 8 if rows.differ else 1  # in plain torch, for a state with numbers of its own
-        errors = StateErrorPass(basis, parts.target, expected=slower * states)
-    metrics = ChaseMetrics(
-        basis,
+        errors = StateErrorPass(parts.basis, parts.target, expected=slower * states)
+    return ChaseMetrics(
+        parts.basis,
         parts.target,
         parts.law,
         inner_steps=first.inner_steps,
@@ -144,42 +181,19 @@ def _run(
         own=first.metrics,
         errors=errors,
     )
-    tell = _of_whole_problems(advance, len(starts), len(members))
-    blocks, chunk = _pieces(
-        starts, times, basis, jobs=len(members), kept=any(member.sink is not None for member in members)
+
+
+def _chased(first: ChaseProblem, parts: _Objects, starts: Tensor, chunk: int) -> Iterator[ChaseResult]:
+    """Pieces of ``chunk`` times of the chases from initial states (B, n)."""
+    return chase_pieces(
+        trajectory(parts.system, starts, dt=first.dt, steps=first.steps, chunk=chunk),
+        parts.basis,
+        parts.target,
+        parts.law,
+        inner_steps=first.inner_steps,
+        predictor=parts.predictor,
+        certificate=first.certificate,
     )
-    told = alone and len(blocks) == 1  # the engine warns of the reach, else each member of its own
-    done, reach = 0, torch.zeros(len(starts), dtype=starts.dtype, device=starts.device)  # largest |x| nu(x)
-    with torch.no_grad(), warnings.catch_warnings():
-        if not told:
-            warnings.filterwarnings("ignore", message=REACH)
-        for block in blocks:
-            here, time = slice(done, done + len(block)), 0
-            if done:
-                metrics.next_rows()
-            with rows.of(here):
-                chased = chase_pieces(
-                    trajectory(parts.system, block, dt=first.dt, steps=first.steps, chunk=chunk),
-                    basis,
-                    parts.target,
-                    parts.law,
-                    inner_steps=first.inner_steps,
-                    predictor=parts.predictor,
-                    certificate=first.certificate,
-                )
-                for result in chased:
-                    metrics.add(result)
-                    if not told:
-                        reach[here] = torch.maximum(reach[here], _reach(basis, result.state))
-                    _distribute(result, done, time, members)
-                    time += result.state.shape[1]
-                    tell(result.state.shape[0] * result.state.shape[1])
-                    del result  # before the next one is made
-            done += len(block)
-    if alone and not told:
-        basis.warn_reach(float(reach.max()), stacklevel=2)
-    found = zip(members, metrics.summaries(), reach.split([member.rows for member in members]), strict=True)
-    return [member.outcome(summary, float(own.max()), alone=alone) for member, summary, own in found]
 
 
 def _pieces(

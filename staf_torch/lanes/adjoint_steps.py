@@ -134,7 +134,7 @@ class ReversedStep:
 
 
 class Deciding(NamedTuple):
-    """What an adjoint depends on.
+    """Facts that an adjoint depends on.
 
     Args:
         carry: which leaves of the carry decide, now or later, what has a gradient: all goes through them.

@@ -89,12 +89,17 @@ def uniform(seed: Tensor, step: Tensor, count: int) -> Tensor:
     return torch.stack(both, dim=-1).flatten(-2)[..., :count]
 
 
-def _numbers(
-    a: Tensor, b: Tensor, c: Tensor, d: Tensor, low: Tensor, high: Tensor, block: Tensor, second: bool
-) -> Tensor:
-    """The first or second number of a block: key (a, b), (c, d), counter (low, high), block, 0, 0."""
-    key = [one.long() + (other.long() << 16) for one, other in ((a, b), (c, d))]
-    step, place = low.long() + (high.long() << 16), block.long()
+def _numbers(halves: Sequence[Tensor], block: Tensor, second: bool) -> Tensor:
+    """The first or second number of a block: key (a, b), (c, d), counter (low, high), block, 0, 0.
+
+    Args:
+        halves: a, b, c, d, low, high, each below 2^16.
+        block, second: which number.
+    """
+    low, place = halves[4], block.long()
+    *key, step = (
+        one.long() + (other.long() << 16) for one, other in zip(halves[::2], halves[1::2], strict=True)
+    )
     none = torch.zeros_like(place)
     counter, chosen = (step, place, none, none), slice(2 * second, 2 * second + 2)
     if type(low) is Tensor and low.is_cpu and low.dim():  # a plain loop of few rows draws at every step
@@ -112,7 +117,7 @@ def _signed(word: Any) -> Tensor:
 _LIBRARY = torch.library.Library("staf_torch", "FRAGMENT")
 _PARTS = ", ".join(f"Tensor {name}" for name in ("a", "b", "c", "d", "low", "high", "block"))
 _LIBRARY.define(f"philox({_PARTS}, bool second) -> Tensor")
-_LIBRARY.impl("philox", _numbers, "CompositeExplicitAutograd")
+_LIBRARY.impl("philox", lambda *parts: _numbers(parts[:6], *parts[6:]), "CompositeExplicitAutograd")
 
 
 def _of_rows(info: object, dims: Sequence[int | None], *args: object) -> tuple[Tensor, int]:

@@ -90,52 +90,14 @@ def fill(
         for row in _rows(directory / ROWS, len(overrides)):
             ended(row["num"], row["reason"])
         return
-    keep = "history" in jobs.fixed and jobs.base.history is True
-    fixed = ("figures=false", f"history={str(keep).lower()}")
-    piece = max(_PIECE, most or 0) * min(_AHEAD, executor.workers)
-    shared, done = jobs.fixed, len(before.made)
-
-    def composed(begin: int) -> tuple[ManySettings, list[Mapping[str, Any]]]:
-        return jobs.many([[*job, *fixed] for job in overrides[begin : begin + piece]])
-
-    first = composed(0)  # before anything is written: most wrong names are refused here
-    if piece < len(overrides) and most is None and not keep and are_light(first[1]):
-        piece *= _LIGHT
-        first = composed(0)
-    for begin in range(0, done, piece):
-        _, flat = composed(begin) if begin else first
-        _refuse_others(overrides, begin, flat, before.made[begin : begin + piece])
-    ready = [first] if done < piece else []
-    del first
-
-    def computed(begin: int, write: Write, completed: list[int]) -> int:
-        """Compute the jobs of a piece and write their rows; return how many lost their workers."""
-        cfgs, flat = ready.pop() if ready else composed(begin)
-        rows, lost = _InOrder(write, [made_by(one) for one in flat], max(0, done - begin)), 0
-
-        def place(index: int) -> Path:
-            return directory / FOLDER / str(begin + index)
-
-        outcomes = compute(
-            *(cfgs, flat, place, executor),
-            finished=range(rows.written),
-            most=most,
-            measured=not keep,
-            tell=lambda count: tell(begin + count),
-        )
+    table = _Table(
+        overrides, directory, executor, _Pieces(jobs, overrides, executor, most), most, ended, tell
+    )
+    done = len(before.made)
+    for begin in range(0, done, table.pieces.size):
+        _, flat = table.pieces.composed(begin)
+        _refuse_others(overrides, begin, flat, before.made[begin : begin + table.pieces.size])
         del flat
-        for index, outcome, _ in outcomes:
-            workers.check()
-            own = [line for line in overrides[begin + index] if line.partition("=")[0] not in shared]
-            row: dict[str, Any] = {"num": begin + index, "overrides": own}
-            row |= _result(cfgs, index, outcome, place(index), keep)
-            gone = isinstance(outcome, Failed) and isinstance(outcome.error, LostError)
-            lost += gone
-            rows.add(index, row, gone)
-            completed[0] = begin + rows.written
-            ended(begin + index, row["reason"])
-        return lost
-
     with (
         _saying_how_to_resume(directory, len(overrides)) as completed,
         recorded(record, directory, 0.0),
@@ -146,11 +108,93 @@ def fill(
         record.measured_in(units_of(jobs.base))
         for row in _rows(directory / partial_name(ROWS), done):
             ended(row["num"], row["reason"])
-        lost = sum(
-            computed(begin, write, completed) for begin in range(done // piece * piece, len(overrides), piece)
-        )
+        begins = range(done // table.pieces.size * table.pieces.size, len(overrides), table.pieces.size)
+        lost = sum(table.compute(begin, done, write, completed) for begin in begins)
         if lost:
             raise LostError(f"{lost} of {len(overrides)} rows lost their workers; sweep.resume computes them")
+
+
+class _Pieces:
+    """Composes the jobs of a table in pieces of ``size`` jobs: memory does not grow with their number.
+
+    The first is composed at once: most wrong names are refused before anything is written.
+    """
+
+    def __init__(
+        self, jobs: SweepJobs, overrides: Sequence[Sequence[str]], executor: Executor, most: int | None
+    ) -> None:
+        self.fixed = jobs.fixed  # settings that all jobs share
+        self.keep = "history" in self.fixed and jobs.base.history is True  # files of every job
+        self.size = max(_PIECE, most or 0) * min(_AHEAD, executor.workers)
+        self._jobs, self._overrides = jobs, overrides
+        self._own = ("figures=false", f"history={str(self.keep).lower()}")
+        self._last: dict[int, tuple[ManySettings, list[Mapping[str, Any]]]] = {}  # by its first job
+        _, flat = self.composed(0)
+        if self.size < len(overrides) and most is None and not self.keep and are_light(flat):
+            self.size *= _LIGHT
+            self._last.clear()
+            self.composed(0)
+
+    def composed(self, begin: int) -> tuple[ManySettings, list[Mapping[str, Any]]]:
+        """Settings of the jobs of a piece, and the same by dotted keys; kept until another is composed."""
+        if begin not in self._last:
+            self._last.clear()
+            jobs = self._overrides[begin : begin + self.size]
+            self._last[begin] = self._jobs.many([[*job, *self._own] for job in jobs])
+        return self._last[begin]
+
+    def taken(self, begin: int) -> tuple[ManySettings, list[Mapping[str, Any]]]:
+        """Settings of the jobs of a piece, which are kept no longer."""
+        self.composed(begin)
+        return self._last.pop(begin)
+
+
+class _Table(NamedTuple):
+    """Jobs of a table, what computes them, and who is told; as `fill` takes them."""
+
+    overrides: Sequence[Sequence[str]]
+    directory: Path
+    executor: Executor
+    pieces: _Pieces
+    most: int | None
+    ended: Callable[[int, str | None], None]
+    tell: Callable[[float], None]
+
+    def compute(self, begin: int, done: int, write: Write, completed: list[int]) -> int:
+        """Compute the jobs of a piece and write the rows from ``done`` on; return how many were lost.
+
+        Args:
+            begin: number of the first job.
+            done: rows that are written.
+            write: appends rows.
+            completed: takes the number of rows after each.
+        """
+        cfgs, flat = self.pieces.taken(begin)
+        rows, lost = _InOrder(write, [made_by(one) for one in flat], max(0, done - begin)), 0
+
+        def place(index: int) -> Path:
+            return self.directory / FOLDER / str(begin + index)
+
+        outcomes = compute(
+            *(cfgs, flat, place, self.executor),
+            finished=range(rows.written),
+            most=self.most,
+            measured=not self.pieces.keep,
+            tell=lambda count: self.tell(begin + count),
+        )
+        del flat
+        for index, outcome, _ in outcomes:
+            workers.check()
+            given = self.overrides[begin + index]
+            own = [line for line in given if line.partition("=")[0] not in self.pieces.fixed]
+            row: dict[str, Any] = {"num": begin + index, "overrides": own}
+            row |= _result(cfgs, index, outcome, place(index), self.pieces.keep)
+            gone = isinstance(outcome, Failed) and isinstance(outcome.error, LostError)
+            lost += gone
+            rows.add(index, row, gone)
+            completed[0] = begin + rows.written
+            self.ended(begin + index, row["reason"])
+        return lost
 
 
 class _InOrder:

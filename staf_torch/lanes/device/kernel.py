@@ -228,7 +228,7 @@ class DeviceCall:
         return found
 
     def _too_large(self) -> str:
-        """What to do where results find no room."""
+        """Tell what to do where results find no room."""
         times = -(-self._steps // self._every)
         return (
             f"The results of this call take {self._bytes / 1e9:.3g} GB on {self._where}, for {self._rows} "

@@ -40,7 +40,7 @@ class Recipe(NamedTuple):
 
     @property
     def repeats(self) -> bool:
-        """Whether other numbers follow from other tensors."""
+        """Return whether other numbers follow from other tensors."""
         return all(tensor.numel() for tensor in self.found)
 
     def again(self, others: Mapping[int, Tensor]) -> Tensor | None:

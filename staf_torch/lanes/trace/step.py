@@ -98,62 +98,92 @@ def trace(step: Step, given: Given, *, widened: bool = False, folded: bool = Fal
     graph = Graph(given.real == torch.float32 and not widened)
     tracer = Tracer(graph, lower, widened=widened, folded=folded)
 
-    def inputs(op: str, leaves: Sequence[Any], depth: int, times: int) -> list[Tensor]:
-        traced = []
-        for slot, leaf in enumerate(leaves):
-            at = plain(leaf).detach()
-            at = at if isinstance(leaf, Shared) else at[:1]
-            at = at.select(0 if isinstance(leaf, Shared) else 1, 0) if times else at
-            traced.append(tracer.input(at, op, slot, depth))
-        return traced
-
+    own = _OwnNumbers(tracer, len(given.row), folded)
     with torch.no_grad():
-        row = given.tree("row", inputs("row", given.row, 0, 0))
-        now = given.tree("now", inputs("now", given.now, NOW, 1))
-        carry = inputs("state", given.carry, STEP, 0)
-        own: dict[int, tuple[RowNumbers, Tensor]] = {}
-
-        def one(numbers: RowNumbers) -> Tensor:
-            if folded:
-                raise NotLoweredError(
-                    "it reads numbers of `rows(...)`, which this form of the program cannot hold"
-                )
-            if id(numbers) not in own:
-                with _outside_transforms():  # met first in a derivative, say
-                    found = tracer.input(numbers.full[:1], "row", len(given.row) + len(own))[0]
-                own[id(numbers)] = numbers, found
-            return own[id(numbers)][1]
-
-        with tracer, tracing(tracer), resolving(one), _TorchFunctions(tracer):
-            try:
-                after, out = step(given.tree("carry", carry), now, row)
-            except NotLoweredError:
-                raise
-            except (
-                Exception
-            ) as error:  # of the step itself, which the definition raises again, or of the tracer
-                raise NotLoweredError(f"{type(error).__name__}: {error}") from error
+        row = given.tree("row", _inputs(tracer, "row", given.row, 0, 0))
+        now = given.tree("now", _inputs(tracer, "now", given.now, NOW, 1))
+        carry = _inputs(tracer, "state", given.carry, STEP, 0)
+        with tracer, tracing(tracer), resolving(own), _TorchFunctions(tracer):
+            after, out = _taken(step, given.tree("carry", carry), now, row)
         ends, structure = flatten(after)
-        if structure != given.structures["carry"] or [(e.shape, e.dtype) for e in ends] != [
-            (c.shape, c.dtype) for c in carry
-        ]:
+        if structure != given.structures["carry"] or _forms(ends) != _forms(carry):
             raise NotLoweredError(_other_carry("the step returns", ends, carry))
         leaves, shape = flatten(out)
-        if any(isinstance(leaf, RowNumbers) for leaf in (*ends, *leaves)):
-            raise NotLoweredError("it reads numbers of `rows(...)` in another thread than the call's")
-        if any(leaf.dim() == 0 or leaf.shape[0] != 1 for leaf in leaves):
-            raise NotLoweredError("an output of the step has no dimension of rows")
+        _refuse_outputs(ends, leaves)
         following = [node for end in ends for node in tracer.nodes(end).ravel().tolist()]
         outputs = [node for leaf in leaves for node in tracer.nodes(leaf).ravel().tolist()]
         layout = Sizes(
-            [_entries(leaf, 1) for leaf in given.row] + [numbers.numel() for numbers, _ in own.values()],
+            [_entries(leaf, 1) for leaf in given.row] + [numbers.numel() for numbers in own.read],
             [_entries(leaf, 2) for leaf in given.now],
             [_entries(leaf, 1) for leaf in given.carry],
             [leaf.numel() for leaf in leaves],
         )
     shapes = tuple((leaf.shape[1:], leaf.dtype) for leaf in leaves)
-    rows = tuple(numbers for numbers, _ in own.values())
-    return Traced((graph, layout, following, outputs), shapes, shape, tracer.captured.recipe(), rows)
+    return Traced((graph, layout, following, outputs), shapes, shape, tracer.captured.recipe(), own.read)
+
+
+class _OwnNumbers:
+    """Numbers of `rows(...)` that a step has read, in order: inputs that follow those of the row.
+
+    Args:
+        tracer: of the step.
+        first: how many inputs of a row there are before.
+        folded: whether the program cannot hold them.
+    """
+
+    def __init__(self, tracer: Tracer, first: int, folded: bool) -> None:
+        self._tracer, self._first, self._folded = tracer, first, folded
+        self._found: dict[int, tuple[RowNumbers, Tensor]] = {}
+
+    def __call__(self, numbers: RowNumbers) -> Tensor:
+        """The input of one row that takes their place."""
+        if self._folded:
+            raise NotLoweredError(
+                "it reads numbers of `rows(...)`, which this form of the program cannot hold"
+            )
+        if id(numbers) not in self._found:
+            with _outside_transforms():  # met first in a derivative, say
+                slot = self._first + len(self._found)
+                found = self._tracer.input(numbers.full[:1], "row", slot)[0]
+            self._found[id(numbers)] = numbers, found
+        return self._found[id(numbers)][1]
+
+    @property
+    def read(self) -> tuple[RowNumbers, ...]:
+        return tuple(numbers for numbers, _ in self._found.values())
+
+
+def _inputs(tracer: Tracer, op: str, leaves: Sequence[Any], depth: int, times: int) -> list[Tensor]:
+    """Leaves of an input for a single row, at one time where they have times."""
+    traced = []
+    for slot, leaf in enumerate(leaves):
+        at = plain(leaf).detach()
+        at = at if isinstance(leaf, Shared) else at[:1]
+        at = at.select(0 if isinstance(leaf, Shared) else 1, 0) if times else at
+        traced.append(tracer.input(at, op, slot, depth))
+    return traced
+
+
+def _taken(step: Step, carry: Any, now: Any, row: Any) -> tuple[Any, Any]:
+    """The step; an error of its own, which the definition raises again, is NotLoweredError."""
+    try:
+        after, out = step(carry, now, row)
+    except NotLoweredError:
+        raise
+    except Exception as error:
+        raise NotLoweredError(f"{type(error).__name__}: {error}") from error
+    return after, out
+
+
+def _forms(leaves: Sequence[Any]) -> list[tuple[torch.Size, torch.dtype]]:
+    return [(leaf.shape, leaf.dtype) for leaf in leaves]
+
+
+def _refuse_outputs(ends: Sequence[Any], leaves: Sequence[Any]) -> None:
+    if any(isinstance(leaf, RowNumbers) for leaf in (*ends, *leaves)):
+        raise NotLoweredError("it reads numbers of `rows(...)` in another thread than the call's")
+    if any(leaf.dim() == 0 or leaf.shape[0] != 1 for leaf in leaves):
+        raise NotLoweredError("an output of the step has no dimension of rows")
 
 
 def _other_carry(who: str, found: Sequence[Tensor], given: Sequence[Tensor]) -> str:

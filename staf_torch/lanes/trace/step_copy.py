@@ -101,7 +101,7 @@ class StepCopy:
         return self.graph.add("load", (array,), type, (here, at, stride), STEP + 1)
 
     def _stays(self, number: int) -> bool:
-        """Whether a loop stays one: it has no loops in it, and its carry is single numbers."""
+        """Return whether a loop stays one: it has no loops in it, and its carry is single numbers."""
         old, loop = self._of, self._of.loops[number]
         inner = any(other.home >= loop.depth for other in old.loops)
         return not inner and all(old.op[node] == "carry" for node in loop.carry)

@@ -25,7 +25,7 @@ _MOST = 1000  # entries of YAML that are kept
 
 
 class NodeOfJob(NamedTuple):
-    """What Hydra's node of a job says."""
+    """Facts that Hydra's node of a job says."""
 
     directory: str  # absolute
     node: Mapping[str, Any]  # as it is written: interpolations are not looked up

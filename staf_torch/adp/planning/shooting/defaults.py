@@ -1,4 +1,4 @@
-"""What direct shooting takes where nothing is given: the regulator, the end of a plan, horizon and mesh."""
+"""Defaults of direct shooting: the regulator, the end of a plan, horizon and mesh."""
 
 from __future__ import annotations
 

@@ -227,7 +227,7 @@ class DirectShooting:
         return self._as_base(found, x0)
 
     def _as_base(self, found: Optimum, x0: Tensor) -> Optimum:
-        """What was found, and where it costs more than following the base: improved from there, or NaN."""
+        """Return what was found; where following the base costs less, improved from there, or NaN."""
         followed = follow(self, _always(self.bases[0]), x0, found.time.diff())
         rows = dearer(found.value, followed.cost).nonzero().flatten()
         if not len(rows):  # costs time alone

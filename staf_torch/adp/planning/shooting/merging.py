@@ -92,7 +92,7 @@ def dearer(value: Tensor, followed: Tensor) -> Tensor:
 
 
 def replaced(found: Optimum, rows: Tensor, again: Optimum, believed: Tensor, followed: Tensor) -> Optimum:
-    """What was found, with what was found from the base in some rows, or NaN where that costs more too.
+    """Join what was found with what was found from the base in some rows, or NaN where that costs more too.
 
     Args:
         found: B rows.
