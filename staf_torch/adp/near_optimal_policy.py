@@ -21,7 +21,7 @@ from ..lanes.row_numbers import all_rows
 from ..lanes.row_objects import refuse_rows
 from ..numerics.checks import integer, one_or_each, positive
 from ..numerics.default_device import beside
-from ..numerics.shown import shown, sizes
+from ..numerics.repr_text import shown, sizes
 from ..signs import Sign
 from ..systems import Plant
 from ..systems.base import spread_of

@@ -22,7 +22,7 @@ from ..adp.planning.receding_horizon import StrainedPlans
 from ..approximation.staf import StaF
 from ..deploy import approximator, policy_of
 from ..deploy.controllers import in_dtype
-from ..deploy.sheet import Port
+from ..deploy.data_sheet import Port
 from ..experiments.adp import innermost, learner
 from ..numerics.checks import fail, integer
 from ..results import run_record as records

@@ -14,10 +14,10 @@ import torch
 from torch import Tensor
 
 from .. import __version__
-from ..deploy import c_header, export_learning_c, formats, sheet, trace
+from ..deploy import c_header, data_sheet, export_learning_c, formats, trace
+from ..deploy.data_sheet import Port
 from ..deploy.names import made_name
 from ..deploy.onnx_loops import in_loops
-from ..deploy.sheet import Port
 from ..lanes.emit.identifiers import checked_names
 from ..numerics.checks import choice, fail
 from ..results.build import processor
@@ -49,7 +49,7 @@ def export(
     output: Path | None = None,
     row: int = 0,
     batch: int | None = None,
-    calls: int = sheet.CALLS,
+    calls: int = data_sheet.CALLS,
     trust: bool = False,
     name: str | None = None,
     function: bool = False,
@@ -103,7 +103,7 @@ def export_learning(
     dtype: str = "float64",
     output: Path | None = None,
     row: int = 0,
-    calls: int = sheet.CALLS,
+    calls: int = data_sheet.CALLS,
     trust: bool = False,
     name: str | None = None,
 ) -> dict[str, Any]:
@@ -132,9 +132,11 @@ def export_learning(
     exact, rough = _followed(found, torch.float64), _followed(found, torch.float32)
     wanted = exact if real == torch.float64 else rough
     facts = {
-        "equality": {"u": sheet.worst_difference((device(states, uniform),), (wanted,))[0]},
-        "float32_error": {"u": sheet.worst_difference((rough,), (exact,))[0]},
-        "latency": dataclasses.asdict(sheet.latency(lambda x: device(x, uniform[:1]), states[:1], calls)),
+        "equality": {"u": data_sheet.worst_difference((device(states, uniform),), (wanted,))[0]},
+        "float32_error": {"u": data_sheet.worst_difference((rough,), (exact,))[0]},
+        "latency": dataclasses.asdict(
+            data_sheet.latency(lambda x: device(x, uniform[:1]), states[:1], calls)
+        ),
     }
     ports = {"inputs": found.inputs, "outputs": found.outputs}
     entries = sum(port.size or 1 for port in (*found.inputs, *found.outputs))
@@ -176,7 +178,7 @@ def _page(
     origin: dict[str, object],
     ends: dict[str, Any],
     ports: dict[str, tuple[Port, ...]],
-    work: sheet.Work,
+    work: data_sheet.Work,
     facts: dict[str, Any],
 ) -> dict[str, Any]:
     """Write the sheet beside a file that computes what the library does, and return it."""
@@ -201,7 +203,7 @@ def _page(
         **facts,
     }
     write_text(path.with_name(path.name + ".json"), json.dumps(page, indent=2, allow_nan=False) + "\n")
-    write_text(path.with_name(path.name + ".md"), sheet.markdown(page))
+    write_text(path.with_name(path.name + ".md"), data_sheet.markdown(page))
     return page
 
 
@@ -213,7 +215,7 @@ def _write(
     origin: dict[str, object],
     dtype: torch.dtype,
     batch: int | None,
-) -> tuple[formats.Run, sheet.Work]:
+) -> tuple[formats.Run, data_sheet.Work]:
     names, name, example = [port.name for port in found.outputs], str(origin["name"]), found.points.to(dtype)
     if to == "onnx":
         written = in_loops(module, example, [found.input.name, *names], batch, name)
@@ -224,18 +226,18 @@ def _write(
     program = trace(module, example, batch=batch)
     if to == "onnx":
         formats.export_onnx(program, path, [found.input.name], names, name=name)
-        return formats.runner_onnx(path), sheet.work(program)
+        return formats.runner_onnx(path), data_sheet.work(program)
     if to == "pt2":
         said = {"input": dataclasses.asdict(found.input), "outputs": names, "what": found.what}
         formats.export_program(program, path, {"version": __version__, **origin, **said})
-        return formats.runner_program(path), sheet.work(program)
+        return formats.runner_program(path), data_sheet.work(program)
     formats.export_package(program, path)
-    return formats.runner_package(path), sheet.work(program)
+    return formats.runner_package(path), data_sheet.work(program)
 
 
 def _write_c(
     module: torch.nn.Module, path: Path, found: Deployable, origin: dict[str, object], dtype: torch.dtype
-) -> tuple[formats.Run, sheet.Work]:
+) -> tuple[formats.Run, data_sheet.Work]:
     names, sizes = [port.name for port in found.outputs], [port.size for port in found.outputs]
     note = f"{found.what}\nFrom {origin['run']}, trajectory {origin['row']}, staf_torch {__version__}."
     example = found.points.to(dtype)
@@ -256,9 +258,9 @@ def _measure(
         got = [call(piece) for piece in pieces]
         rough = formats.as_tuple(found.module(torch.float32)(single))
         exact = formats.as_tuple(found.module(torch.float64)(single.double()))
-    equality = sheet.worst_difference(tuple(map(torch.cat, zip(*got, strict=True))), made)
-    error = sheet.worst_difference(rough, exact)
-    late = sheet.latency(call, points[: batch or 1].clone(), calls)
+    equality = data_sheet.worst_difference(tuple(map(torch.cat, zip(*got, strict=True))), made)
+    error = data_sheet.worst_difference(rough, exact)
+    late = data_sheet.latency(call, points[: batch or 1].clone(), calls)
     return {
         "latency": dataclasses.asdict(late),
         "equality": dict(zip(names, equality, strict=True)),
@@ -280,7 +282,7 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("--row", type=int, default=0, help="trajectory of the run, from 0 on (0)")
     found.add_argument("--batch", type=int, help="fixed number of rows of a call (any)")
     found.add_argument(
-        "--calls", type=int, default=sheet.CALLS, help=f"calls timed for the sheet ({sheet.CALLS})"
+        "--calls", type=int, default=data_sheet.CALLS, help=f"calls timed for the sheet ({data_sheet.CALLS})"
     )
     found.add_argument(
         "--learning",
@@ -317,4 +319,4 @@ def main(arguments: list[str] | None = None) -> None:
             page = export_learning(**given)
     except (ValueError, OSError) as error:
         sys.exit(f"staf-export: {visible(str(error))}")
-    printed(sheet.markdown(page))
+    printed(data_sheet.markdown(page))

@@ -16,10 +16,10 @@ from torch import Tensor, nn
 
 from ..adp import Controller
 from ..lanes import Program
+from ..lanes.call_inputs import Given
 from ..lanes.compiler import run
 from ..lanes.emit.c import commented
 from ..lanes.emit.identifiers import checked_names, guarded
-from ..lanes.given import Given
 from ..lanes.row_objects import refuse_rows, row_of
 from ..lanes.trace.graph import WIDE
 from ..lanes.trace.step import trace
@@ -28,11 +28,11 @@ from ..lanes.tree import Tree, flatten, labels
 from ..numerics.checks import fail
 from ..signs import Sign
 from .controllers import FilteredPolicy, SupervisedPolicy, check_bounded, in_dtype, searches
-from .counted import Source, counted
+from .data_sheet import Latency
 from .formats import Run, as_tuple
 from .names import check_count, check_dtype, function_name, listed_names
-from .remembered import RememberedPolicy
-from .sheet import Latency
+from .remembered_policy import RememberedPolicy
+from .scalar_program import Source, counted
 
 _log = logging.getLogger(__name__)
 

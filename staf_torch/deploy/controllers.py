@@ -27,7 +27,7 @@ from ..adp.planning.shooting.optimum import PlanReplay
 from ..lanes.row_objects import refuse_rows, row_of
 from ..local_basis.graded import GradedBasis
 from ..numerics.checks import fail, hold, trailing
-from .remembered import RememberedPolicy
+from .remembered_policy import RememberedPolicy
 
 Some = TypeVar("Some")
 

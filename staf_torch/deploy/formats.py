@@ -18,10 +18,10 @@ from torch.export import ExportedProgram
 
 from ..numerics.checks import fail, integer, trailing
 from ..signs import Sign
-from .counted import Source
 from .graph import trace
 from .names import check_count, check_dtype, function_name, listed_names
 from .onnx_loops import in_loops, renamed
+from .scalar_program import Source
 
 FORMAT = 1
 """Of the note inside a .pt2 file; raised when an older reader would go wrong."""

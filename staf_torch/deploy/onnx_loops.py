@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from .counted import Source
 from .names import check_count
 from .onnx_writer import OnnxWriter
+from .scalar_program import Source
 
 
 class OnnxFile(NamedTuple):

@@ -26,7 +26,7 @@ from .predictors import Predictor
 from .problem import Problem
 from .quantities import Known, know, numbers, precompute, with_certificate
 from .recursion import Carry, Corrected, Inputs, Recursion, kept_gain, last_weights, lost, recursion, start
-from .repeated import key_of, remember, repeated
+from .repeated_chase import key_of, remember, repeated
 from .result import ChaseResult, ChaseWeights, concatenate
 
 _WORKING_BYTES = 2**26

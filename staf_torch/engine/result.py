@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from torch import Tensor
 
 from ..lanes.device.chunks import joined
-from ..numerics.shown import span
+from ..numerics.repr_text import span
 from .certificate import Certificate
 
 

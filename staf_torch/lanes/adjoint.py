@@ -18,8 +18,8 @@ from torch import Tensor
 from .adjoint_steps import Substituted
 from .backward import Backward
 from .call import Compiled, PlannedCall, Where, served
+from .call_inputs import Given
 from .device.kernel import DeviceCall
-from .given import Given
 from .growth import Slope, grown, say_grown
 from .log import say
 from .row_numbers import RowNumbers, columns

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from .given import Given
+from .call_inputs import Given
 from .row_numbers import RowNumbers
 from .trace.reversed_program import reversed_program
 from .trace.step import Step, Traced, trace

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from .adjoint_steps import Deciding, Differentiated, ReversedStep, Substituted, adjoint_step, deciding
-from .given import Given
+from .call_inputs import Given
 from .row_independence import undrawn
 from .row_sums import UNIT, AtTimes, by_units, empty_rows, halved, joined, part, split
 from .trace.captured_tensors import TableSlopes

@@ -24,8 +24,8 @@ from torch.utils import _device
 from ..signs import Sign
 from .call import at_once, ordinary
 from .call import served as served_by
+from .call_inputs import one_precision
 from .contents import BOUND, Contents
-from .given import one_precision
 from .locks import Mutex
 from .loops import tracing_now
 from .one_thread import ENTRIES, alone

@@ -12,17 +12,17 @@ from torch import Tensor
 from ..signs import Sign
 from .adjoint_steps import keeping_step
 from .call import Compiled, form, ordinary, served
+from .call_inputs import Given, one_precision, whole
 from .compiler import machine_code
 from .contents import Contents, Derived
 from .emit.c import Names, c_text
 from .emit.cpp import emit
-from .given import Given, one_precision, whole
 from .locks import Mutex
 from .log import say
 from .loops import scan, tracing_now
 from .one_thread import ENTRIES, alone
 from .opaque import opaque
-from .prepared import Prepared
+from .prepared_call import Prepared
 from .row_independence import doubt, undrawn
 from .row_numbers import over_rows, points_of_rows
 from .texts import Built, Form, kernel, known

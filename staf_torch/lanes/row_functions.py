@@ -9,7 +9,7 @@ from torch import Tensor
 
 from . import call
 from .call import PlannedCall
-from .prepared import Plan
+from .prepared_call import Plan
 from .program import Program
 from .shared_programs import shared_program
 from .trace.step import Step

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-from .given import Given
+from .call_inputs import Given
 from .loops import few_passes
 from .plain_time import RepaysError
 from .row_numbers import over_rows, some_rows

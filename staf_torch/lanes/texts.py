@@ -12,12 +12,12 @@ from . import cache
 from .adjoint_steps import ReversedStep
 from .cache import Trace
 from .call import Compiled
+from .call_inputs import Given
 from .compiler import REVERSED
 from .contents import Contents
 from .emit.cpp import emit
 from .emit.cuda import Dtypes, emit_cuda
 from .emit.tables import Text
-from .given import Given
 from .row_numbers import RowNumbers
 from .trace.step import Step, Traced, trace
 from .trace.tracer import NotLoweredError

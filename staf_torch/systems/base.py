@@ -16,7 +16,7 @@ from ..numerics.angles import wrap
 from ..numerics.checks import trailing
 from ..numerics.default_device import device_of
 from ..numerics.linalg import point_jacobian
-from ..numerics.shown import limits, settings, sizes
+from ..numerics.repr_text import limits, settings, sizes
 from .bounds import Bounds
 
 _HERE = torch.empty(0, dtype=torch.float64, device="cpu")

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from staf_torch import ExponentialKernel, StaF, StaFBasis, StateFollowingCenters, deploy, rings, targets
-from staf_torch.deploy.sheet import latency
+from staf_torch.deploy.data_sheet import latency
 from staf_torch.results.build import processor
 
 STATE = torch.tensor([1.0, 0.3], dtype=torch.float64)

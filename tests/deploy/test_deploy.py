@@ -37,7 +37,7 @@ from staf_torch import (
     systems,
     targets,
 )
-from staf_torch.deploy import formats, sheet
+from staf_torch.deploy import data_sheet, formats
 from staf_torch.deploy.c_header import need_c_compiler, runner_c
 
 PLANT = systems.TwoState()
@@ -232,7 +232,7 @@ def test_c_header_computes_the_same(name: str, dtype: torch.dtype, tmp_path: Pat
     run = runner_c(tmp_path / "a.h", [None if out.dim() == 1 else out.shape[1] for out in wanted], dtype)
     loss = 100 if name == "rollout" else 1  # its differences, in float
     tolerance = 1e-12 if dtype == torch.float64 else loss * 1e-6
-    assert max(sheet.worst_difference(run(x), wanted)) <= tolerance
+    assert max(data_sheet.worst_difference(run(x), wanted)) <= tolerance
 
 
 @needs_onnx
@@ -246,8 +246,8 @@ def test_onnx_file_computes_the_same_in_onnxruntime(tmp_path: Path) -> None:
     for rows in (1, 7):
         value, gradient, third = run(y[:rows])
         wanted = (staf(y[:rows]), staf.gradient(y[:rows]))
-        assert max(sheet.worst_difference((value, gradient), wanted)) <= 1e-12
-        assert sheet.worst_difference((third,), (module(y[:rows])[2],))[0] <= 1e-15
+        assert max(data_sheet.worst_difference((value, gradient), wanted)) <= 1e-12
+        assert data_sheet.worst_difference((third,), (module(y[:rows])[2],))[0] <= 1e-15
 
 
 def test_operations_are_counted_by_the_entries_that_they_make() -> None:
@@ -256,7 +256,7 @@ def test_operations_are_counted_by_the_entries_that_they_make() -> None:
             moved = torch.cat((x.unsqueeze(1), x.reshape(1, 1, 2)), 1).transpose(1, 2)
             return 3.0 * x, x.sum(-1), x.mean(-1), x.amax(-1), x.exp() + x.sin(), moved
 
-    counted = sheet.work(deploy.trace(Module(), X, batch=1))
+    counted = data_sheet.work(deploy.trace(Module(), X, batch=1))
     assert counted.flops == 2 + 1 + 1 + 1 + 2  # products, three reductions, sums; what only moves is free
     assert counted.functions == 4
     assert counted.bytes_in_out == 8 * (2 + 2 + 1 + 1 + 1 + 2 + 4)
@@ -391,7 +391,7 @@ def test_a_sheet_is_one_page_and_names_nothing_that_a_terminal_obeys() -> None:
         **{"runtime": "C", "machine": "a processor"},
         **{"equality": {"u": 1.234e-7}, "float32_error": {"u": 0.5}},
     }
-    lines = sheet.markdown(page).splitlines()
+    lines = data_sheet.markdown(page).splitlines()
     assert (
         "From `/runs/a'b\\nc\\u001b[2J`, trajectory 3, by staf_torch 1.2 and torch 2.9. Batch B: any. "
         "Name: `policy`." in lines
@@ -407,7 +407,7 @@ def test_calls_are_timed_on_one_core_after_others_that_warm_it() -> None:
     if not hasattr(os, "sched_getaffinity"):
         pytest.skip("no choice of a core here")
     before, cores = os.sched_getaffinity(0), []
-    found = sheet.latency(lambda x: cores.append(frozenset(os.sched_getaffinity(0))), X, calls=7)
+    found = data_sheet.latency(lambda x: cores.append(frozenset(os.sched_getaffinity(0))), X, calls=7)
     assert found.calls == 7 < len(cores)
     assert 0 <= found.median_us <= found.p99_us <= found.worst_us
     assert set(cores) == {frozenset({max(before)})}

@@ -69,7 +69,7 @@ def words(outcome: Outcome) -> str:
 
 
 def chosen(name: str, cfgs: Sequence[DictConfig], together: Sequence[Any]) -> tuple[DictConfig, Any]:
-    """The first or, of every other name, the last member, and what it got; in all that is listed they differ."""
+    """The first or, of every other name, the last member, and what it got: they differ in all settings."""
     assert len(cfgs) == len(together)
     index = 0 if len(name) % 2 else -1
     return cfgs[index], together[index]

@@ -20,7 +20,7 @@ from ...lanes.row_objects import OfRows
 from ...numerics.checks import fail, real, trailing
 from ...numerics.default_device import beside
 from ...numerics.linalg import riccati
-from ...numerics.shown import limits, shown
+from ...numerics.repr_text import limits, shown
 from ...systems import Plant
 from ..problem.cost import Cost, matvec, quadratic
 from ..problem.held_linear import held_riccati

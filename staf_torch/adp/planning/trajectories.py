@@ -7,8 +7,8 @@ from typing import NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
+from ...numerics.repr_text import span
 from ...numerics.rows import chosen as chosen
-from ...numerics.shown import span
 from ..problem.sampled import SampledProblem
 
 _LENGTHS = (2, 4, 7, 12, 20, 30)  # periods for which a corner of the bounds is held before the feedback

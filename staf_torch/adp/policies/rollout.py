@@ -18,7 +18,7 @@ from ...lanes.call import PlannedCall
 from ...lanes.contents import Contents
 from ...lanes.each_row import each_row
 from ...lanes.one_thread import small
-from ...lanes.prepared import Plan
+from ...lanes.prepared_call import Plan
 from ...lanes.row_functions import Rows, check_states
 from ...lanes.row_numbers import RowNumbers, points_of_rows
 from ...lanes.row_objects import Rowwise

@@ -24,8 +24,8 @@ from ...numerics.checks import (
 )
 from ...numerics.default_device import beside, device_of
 from ...numerics.linalg import Matrix, positive_definite, positive_semidefinite, square
+from ...numerics.repr_text import limits, shown, sizes
 from ...numerics.row_checks import check_rows
-from ...numerics.shown import limits, shown, sizes
 from ...systems import Bounds, Plant
 from ...systems.bounds import Limit
 from ...systems.equilibria import resting_input_at

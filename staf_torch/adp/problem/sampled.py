@@ -22,9 +22,9 @@ from ...numerics.checks import fail, integer, trailing
 from ...numerics.default_device import beside, device_of
 from ...numerics.forward_mode import use_forward_mode
 from ...numerics.linalg import Matrix, discrete_riccati, positive_semidefinite, square, unstabilisable_mode
+from ...numerics.repr_text import limits, sizes
 from ...numerics.row_checks import check_rows, is_ours
 from ...numerics.runge_kutta import runge_kutta_mean, runge_kutta_stages
-from ...numerics.shown import limits, sizes
 from ...systems import Bounds, Plant
 from ...systems.bounds import Limit
 from .cost import Cost, EndValue

@@ -17,7 +17,7 @@ from ...lanes.row_decisions import of_first
 from ...lanes.row_kinds import kinds_of_rows, of_kinds, whichever
 from ...numerics.checks import fail, one_or_each, positive, positive_real, trailing
 from ...numerics.default_device import beside, device_of
-from ...numerics.shown import limits, shown
+from ...numerics.repr_text import limits, shown
 from ...systems import Bounds, Plant
 from ...systems.bounds import Limit
 from ..loop.controller import Carried, Controller, Feedback, Policy

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
+from ..call_inputs import Given
 from ..emit.schedule import Sizes
-from ..given import Given
 from ..loops import tracing
 from ..row_numbers import RowNumbers, made_of_list, resolving
 from ..tree import Shared, Tree, flatten, plain

@@ -29,9 +29,9 @@ from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 from ...settings.plain import ManySettings
-from .alike import NodeOfJob, Texts, absolute
 from .composing import Composer, as_typed, directory_of, parse_override, take_directory
 from .inside import HAS_WHITELIST, configure_logging
+from .job_node import NodeOfJob, Texts, absolute
 
 Plan = tuple[ManySettings, Sequence[Mapping[str, Any]]]
 """The settings of many jobs, and the same by dotted keys."""

@@ -29,8 +29,8 @@ from ...problem.rules import (
 )
 from ...problem.shapes import check_objects, check_policy, check_problem
 from ..trajectories import Trajectories, chosen
+from .best_of_starts import ROWS, cheapest, dearer, joined, merged, replaced, selected
 from .defaults import MOST, end_value, regulator, times
-from .merging import ROWS, cheapest, dearer, joined, merged, replaced, selected
 from .mesh import graded, halved, split
 from .newton import Interval, MeshPlan, NewtonSolution, follow, minimise, replay, why_none
 from .optimum import Optimum

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ....numerics.shown import span
+from ....numerics.repr_text import span
 from ...loop.controller import Controller
 
 

@@ -9,12 +9,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ..lanes.call_inputs import Given
 from ..lanes.emit.schedule import Schedule
-from ..lanes.given import Given
 from ..lanes.row_independence import doubt
 from ..lanes.trace.step import Step, Traced, trace
 from ..lanes.trace.tracer import NotLoweredError
-from .sheet import Work
+from .data_sheet import Work
 
 _CHEAP = set("add sub mul div lt le eq ne and or xor neg abs min max not where sqrt".split())  # noqa: SIM905
 _FREE = set("const elem result collect carry state row now load pack cast loop".split())  # noqa: SIM905

@@ -13,7 +13,7 @@ from ..adp.planning.global_value import follow_plan
 from ..lanes import Program
 from ..lanes.tree import Tree
 from ..numerics.checks import hold
-from .counted import Source
+from .scalar_program import Source
 
 
 class RememberedPolicy(nn.Module):

@@ -9,8 +9,8 @@ import torch
 
 from .adjoint import GradientCall
 from .call import PlannedCall, Where, form, ordinary, say_transformed, seen_by_others
+from .call_inputs import Given, whole
 from .device.kernel import DeviceCall
-from .given import Given, whole
 from .log import say
 from .opaque import opaque
 from .tree import Tree, flatten, unflatten
