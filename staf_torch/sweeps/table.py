@@ -90,13 +90,13 @@ def fill(
         for row in _rows(directory / ROWS, len(overrides)):
             ended(row["num"], row["reason"])
         return
-    table = _Table(
+    work = _RowsToFill(
         overrides, directory, executor, _Pieces(jobs, overrides, executor, most), most, ended, tell
     )
     done = len(before.made)
-    for begin in range(0, done, table.pieces.size):
-        _, flat = table.pieces.composed(begin)
-        _refuse_others(overrides, begin, flat, before.made[begin : begin + table.pieces.size])
+    for begin in range(0, done, work.pieces.size):
+        _, flat = work.pieces.composed(begin)
+        _refuse_others(overrides, begin, flat, before.made[begin : begin + work.pieces.size])
         del flat
     with (
         _saying_how_to_resume(directory, len(overrides)) as completed,
@@ -108,8 +108,8 @@ def fill(
         record.measured_in(units_of(jobs.base))
         for row in _rows(directory / partial_name(ROWS), done):
             ended(row["num"], row["reason"])
-        begins = range(done // table.pieces.size * table.pieces.size, len(overrides), table.pieces.size)
-        lost = sum(table.compute(begin, done, write, completed) for begin in begins)
+        begins = range(done // work.pieces.size * work.pieces.size, len(overrides), work.pieces.size)
+        lost = sum(work.compute(begin, done, write, completed) for begin in begins)
         if lost:
             raise LostError(f"{lost} of {len(overrides)} rows lost their workers; sweep.resume computes them")
 
@@ -149,7 +149,7 @@ class _Pieces:
         return self._last.pop(begin)
 
 
-class _Table(NamedTuple):
+class _RowsToFill(NamedTuple):
     """Jobs of a table, what computes them, and who is told; as `fill` takes them."""
 
     overrides: Sequence[Sequence[str]]
