@@ -17,8 +17,8 @@ import torch
 from ..trace.graph import FLAG, NARROW, REAL, ROW, STEP, WHOLE, WIDE, Graph
 from ..trace.tracer import LARGE, NotLoweredError
 from .c import Names, ScalarWriter, random_numbers
-from .rooms import in_rooms
 from .device_functions import BRANCHLESS, PREFIX, device_functions
+from .rooms import in_rooms
 from .schedule import Schedule, Sizes, made_again
 from .tables import TableWriter, Text
 

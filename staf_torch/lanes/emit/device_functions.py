@@ -48,7 +48,8 @@ _EXP = """__device__ inline double lanes_exp(double x)
     double rest;
     const int n = lanes_reduced(x, rest), half = n >> 1;
     const double found = lanes_raised(1.0 + rest, half) * lanes_raised(1.0, n - half);
-    const double end = lanes_is_nan(high, __double2loint(x)) ? x : high < 0 ? 0.0 : __hiloint2double(0x7ff00000, 0);
+    const double limit = high < 0 ? 0.0 : __hiloint2double(0x7ff00000, 0);
+    const double end = lanes_is_nan(high, __double2loint(x)) ? x : limit;
     return (high & 0x7fffffff) < 0x40877000 ? found : end;
 }
 """
@@ -75,7 +76,8 @@ __device__ inline double lanes_tanh(double x)
     const double at = far ? 20.0 : __hiloint2double(size, low);
     double rest;
     const int n = lanes_reduced(2 * at, rest);
-    const double power = lanes_raised(1.0, n), e = fma(power, rest, power - 1), found = lanes_quotient(e, e + 2);
+    const double power = lanes_raised(1.0, n), e = fma(power, rest, power - 1);
+    const double found = lanes_quotient(e, e + 2);
     const double whole = __hiloint2double(__double2hiint(found) | (high & 0x80000000), __double2loint(found));
     return near || lanes_is_nan(high, low) ? x : whole;
 }
