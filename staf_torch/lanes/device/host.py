@@ -29,14 +29,6 @@ using namespace std;
 #define __constant__ static const
 #define __grid_constant__
 template <typename T> static inline T __ldg(const T *from) { return *from; }
-static inline int __double2loint(double x) { int word[2]; __builtin_memcpy(word, &x, 8); return word[0]; }
-static inline int __double2hiint(double x) { int word[2]; __builtin_memcpy(word, &x, 8); return word[1]; }
-static inline double __hiloint2double(int high, int low) {
-    const int word[2] = {low, high};
-    double x;
-    __builtin_memcpy(&x, word, 8);
-    return x;
-}
 struct Place { long long x; };
 static thread_local Place blockIdx, blockDim, threadIdx;
 """

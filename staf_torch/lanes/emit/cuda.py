@@ -17,7 +17,6 @@ import torch
 from ..trace.graph import FLAG, NARROW, REAL, ROW, STEP, WHOLE, WIDE, Graph
 from ..trace.tracer import LARGE, NotLoweredError
 from .c import Names, ScalarWriter, random_numbers
-from .device_functions import BRANCHLESS, PREFIX, device_functions
 from .rooms import in_rooms
 from .schedule import Schedule, Sizes, made_again
 from .tables import TableWriter, Text
@@ -110,7 +109,6 @@ class _CudaWriter(ScalarWriter, TableWriter):
         body = in_rooms(self._function(lambda: self._body(following, outputs)), LARGE)
         source = [_PRELUDE + "\n".join(self._arguments()), *self._constants]
         source += random_numbers(body, self.real, "__device__ inline")
-        source += device_functions(body)
         source += [f'extern "C" __global__ void {KERNEL}(const __grid_constant__ Call call)', *body]
         return Text("\n".join(source) + "\n", self.table, self.parameters)
 
@@ -168,10 +166,6 @@ class _CudaWriter(ScalarWriter, TableWriter):
 
     def _fma(self, a: str, b: str, c: str) -> str:
         return f"fma{self._suffix}({a}, {b}, {c})"
-
-    def _call(self, op: str, values: Sequence[str], type: str) -> str:
-        text = super()._call(op, values, type)
-        return f"{PREFIX}{text}" if op in BRANCHLESS and (type == WIDE or not self._suffix) else text
 
     def _buffer(self, op: str, place: int, j: int, at: str = "0") -> str:
         slot, entry = self._slot(op, place)
