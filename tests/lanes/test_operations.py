@@ -75,6 +75,7 @@ OPERATIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "erfc": torch.erfc,
     "erfinv": lambda x: torch.erfinv(x / (1 + x.abs())),
     "lgamma": lambda x: torch.lgamma(x.abs() + 0.1),
+    "digamma": lambda x: torch.digamma(x - 0.05),
     "copysign": lambda x: torch.copysign(x, -x.flip(-1)),
     "angle": torch.angle,
     "a norm of order 3": lambda x: torch.linalg.vector_norm(x, 3, -1),
@@ -122,6 +123,11 @@ OPERATIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "chosen by a mask": masked,
     "fmin": lambda x: torch.fmin(x, torch.fmax(x.flip(-1), torch.tensor(0.1))),
     "compared": compared,
+    "slope of digamma": slope(lambda x: torch.digamma(x.abs() + 0.1)),
+    "slopes of what shrinks": slope(lambda x: functional.softshrink(x, 0.1) + functional.hardshrink(x, 0.2)),
+    "slope of a bilinear form": slope(
+        lambda x: functional.bilinear(x, x.sin(), torch.ones(2, SIZE, SIZE).to(x).tril())
+    ),
     "slope of a list": slope(lambda x: x[:, [1, 0, 1, 1]].cumprod(-1)),
     "slope of a product": slope(lambda x: x.prod(-1)),
     "slope of a sort": slope(lambda x: x.sort(-1)[0] * torch.arange(SIZE)),

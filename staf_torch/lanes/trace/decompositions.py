@@ -174,6 +174,66 @@ def angle(x: Tensor) -> Tensor:
     return torch.where(x < 0, torch.pi, torch.where(x != x, x, 0.0))
 
 
+def digamma(x: Tensor) -> Tensor:
+    """The slope of lgamma, as torch computes it: ten steps up, then a series in 1 / x^2 (Cephes)."""
+    left = x < 0
+    up = torch.where(left, 1 - x, x)
+    total = torch.zeros_like(x)
+    for _ in range(10):
+        total = torch.where(up < 10, total - 1 / up, total)
+        up = torch.where(up < 10, up + 1, up)
+    square, series = 1 / (up * up), torch.zeros_like(x)
+    for factor in _OF_DIGAMMA:
+        series = series * square + factor
+    found = up.log() - 0.5 / up - square * series + total
+    turned = found - math.pi / (math.pi * torch.fmod(x, 1.0)).tan()
+    found = torch.where(left, torch.where(x == x.trunc(), torch.nan, turned), found)
+    return torch.where(x == 0, torch.copysign(torch.full_like(x, torch.inf), -x), found)
+
+
+_OF_DIGAMMA = (1 / 12, -691 / 32760, 1 / 132, -1 / 240, 1 / 252, -1 / 120, 1 / 12)
+
+
+def polygamma(n: int, x: Tensor) -> Tensor:
+    """The slope of digamma, n = 1, as torch computes it: six steps up, then a series in 1 / x^2."""
+    if n == 0:
+        return digamma(x)
+    if n != 1:
+        raise NotLoweredError(f"`polygamma({n}, x)` cannot be compiled, only that of 0 and 1")
+    left = x < 0.5
+    up, total = torch.where(left, 1 - x, x), torch.zeros_like(x)
+    for _ in range(6):
+        total, up = total + 1 / (up * up), up + 1
+    square = 1 / (up * up)
+    total = total + (1 + 0.5 / up + square * (1 / 6 - square * (1 / 30 - square / 42))) / up
+    turned = math.pi / (math.pi * x).sin()
+    return torch.where(left, turned * turned - total, total)
+
+
+def _shrink_backward(slope: Tensor, x: Tensor, bound: float) -> Tensor:
+    return torch.where((x >= -bound) & (x <= bound), 0.0, slope)
+
+
+def _trilinear(
+    a: Tensor,
+    b: Tensor,
+    c: Tensor,
+    of_a: Sequence[int],
+    of_b: Sequence[int],
+    of_c: Sequence[int],
+    summed: Sequence[int],
+    unroll_dim: int = 1,
+) -> Tensor:
+    """A sum of products of three tensors, with dimensions of size 1 put into each: `torch.nn.Bilinear`."""
+    parts = []
+    for x, dims in ((a, of_a), (b, of_b), (c, of_c)):
+        for dim in dims:
+            x = x.unsqueeze(dim)
+        parts.append(x)
+    product = parts[0] * parts[1] * parts[2]
+    return product.sum(list(summed)) if summed else product
+
+
 REPLACEMENTS: dict[str, Callable[..., Any]] = {
     "sort": sort,
     "topk": topk,
@@ -189,6 +249,11 @@ REPLACEMENTS: dict[str, Callable[..., Any]] = {
     "searchsorted": searchsorted,
     "angle": angle,
     "prims::erf_inv": erfinv,
+    "prims::digamma": digamma,
+    "polygamma": polygamma,
+    "softshrink_backward": _shrink_backward,
+    "hardshrink_backward": _shrink_backward,
+    "_trilinear": _trilinear,
     "fmin": functools.partial(_of_numbers, pick=torch.minimum),
     "fmax": functools.partial(_of_numbers, pick=torch.maximum),
 }
