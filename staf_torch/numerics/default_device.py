@@ -93,8 +93,8 @@ def where_held(
             if first is None or first.device == where:
                 return method(*args, **more)
             _say_moved(call, where, first.device)
-            given = tree_map_only(Tensor, lambda each: each.to(where), (args[1:], more))
-            answer = method(owner, *given[0], **given[1])  # type: ignore[call-arg]
+            given: Any = tree_map_only(Tensor, lambda each: each.to(where), (args[1:], more))
+            answer = method(*(owner, *given[0]), **given[1])
             found: Found = tree_map_only(Tensor, lambda each: each.to(first.device), answer)
             return found
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
-from ..lanes import Program, Shared
+from ..lanes import Program, Shared, shared_program
+from ..lanes.trace.step import Step
 from ..lanes.tree import Tree
 from .kalman_filter import LocalFilter
 from .local_functions import LocalFunctions
@@ -31,33 +35,46 @@ def after(functions: LocalFunctions | OwnFunctions, carry: Tree, now: Tree, law:
 
     Args:
         functions: the local functions.
-        carry: parts of the state (S, ...), of D its lower triangle, in the dtype of the streams; counts.
+        carry: the table (S, rows) in the dtype of the streams, in three parts of which the second is D's
+            lower triangle; counts (S, 4).
         now: x (S, n), y (S, K) and lapse (S,).
         law: as `law_of`.
     """
-    (parts, counts), (x, y, lapse) = carry, now
+    (*parts, counts), (x, y, lapse) = carry, now
     filter_, real, old = LocalFilter(functions, *law), parts[0].dtype, _state(parts)
     # what counts values has no derivative
     still = {name: getattr(old, name).detach() for name in ("surprises", "told", "leaps")}
     old, x, y = old._replace(**still), x.mT, y.mT
     expected = filter_.expected(old, x, filter_.forgetting**lapse)
-    new, seen = filter_.learned(old, Counts(*counts), x, y, lapse, torch.finfo(real))
+    new, seen = filter_.learned(old, Counts(*counts.unbind(1)), x, y, lapse, torch.finfo(real))
     count = old.mean.shape[1]
     lower = [count * i + j for i, j in _entries(count) if j <= i]
-    kept = new._replace(learned=new.learned.flatten(0, 1)[lower])
-    found = tuple(part.movedim(-1, 0).to(real) for part in kept)
-    return (found, tuple(seen)), tuple(part.mT for part in expected)
+    head = torch.cat((new.anchor, new.last, new.mean.flatten(0, 1)))
+    found = head, new.learned.flatten(0, 1)[lower], torch.cat(new[4:])
+    kept = tuple(part.mT.to(real) for part in found)
+    return (*kept, torch.stack(seen, 1)), tuple(part.mT for part in expected)
 
 
-def _learned(carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
-    return step(carry, now, row)[0], ()
+def _learning(*alike: Tensor) -> Step:
+    """Learn a sample; with the functions that all streams have alike, or none."""
+
+    def learned(carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
+        functions, law = row
+        return after(_functions(functions or alike), carry, now, law)[0], ()
+
+    return learned
 
 
-def _expected(_: Tree, __: Tree, row: Tree) -> tuple[Tree, Tree]:
-    functions, law, parts, x = row
-    filter_ = LocalFilter(_functions(functions), *law)
-    mean, deviation = filter_.expected(_state(parts), x.mT, filter_.forgetting)
-    return (), (mean.mT.to(x.dtype), deviation.mT.to(x.dtype))
+def _expecting(*alike: Tensor) -> Step:
+    """Expect a sample, as `_learning`."""
+
+    def expected(_: Tree, __: Tree, row: Tree) -> tuple[Tree, Tree]:
+        functions, law, parts, x = row
+        filter_ = LocalFilter(_functions(functions or alike), *law)
+        mean, deviation = filter_.expected(_state(parts), x.mT, filter_.forgetting)
+        return (), (mean.mT.to(x.dtype), deviation.mT.to(x.dtype))
+
+    return expected
 
 
 def _functions(functions: Tree) -> OwnFunctions:
@@ -66,12 +83,15 @@ def _functions(functions: Tree) -> OwnFunctions:
     return OwnFunctions(*(part.movedim(0, -1) if part.dim() == d else part.unsqueeze(-1) for part, d in own))
 
 
-def _state(parts: Tree) -> StateParts:
+def _state(parts: Sequence[Tensor]) -> StateParts:
     """The state in float64, D whole: streams are the last dimension."""
-    old = StateParts(*(part.double().movedim(0, -1) for part in parts))
-    count = old.mean.shape[1]
+    head, lower, tail = (part.double().mT for part in parts)
+    outputs, count = len(tail) // 7, math.isqrt(2 * len(lower))
+    mean = head[-(outputs + 1) * count :].unflatten(0, (-1, count))
+    anchor, last = head[: -(outputs + 1) * count].unflatten(0, (2, -1)).unbind()
     places = [max(i, j) * (max(i, j) + 1) // 2 + min(i, j) for i, j in _entries(count)]
-    return old._replace(learned=old.learned[places].unflatten(0, (count, count)))
+    learned = lower[places].unflatten(0, (count, count))
+    return StateParts(anchor, last, mean, learned, *tail.split([*[outputs] * 7, 1, 1]))
 
 
 def _entries(count: int) -> list[tuple[int, int]]:
@@ -80,8 +100,13 @@ def _entries(count: int) -> list[tuple[int, int]]:
 
 FORECAST = Program(step, name="StaFRegressor over a stretch")
 """Expects every sample, and learns it."""
-_LEARN = Program(_learned, name="StaFRegressor.fit")
-_EXPECT = Program(_expected, name="StaFRegressor.predict")
+
+
+def carry_of(state: StreamState) -> tuple[Tensor, ...]:
+    """The carry of a program that goes on from a state: views of a device's table."""
+    _, _, mean, lower, *tail = state.heights
+    parts = state.table.split((2 * state.dim + mean, lower, sum(tail)))
+    return *(part.mT for part in parts), state.counts.mT
 
 
 class KernelFilter:
@@ -99,20 +124,23 @@ class KernelFilter:
             tensor = torch.as_tensor(value, dtype=torch.float64, device=where)
             return tensor.expand(state.streams) if tensor.dim() else Shared(tensor)
 
-        self._functions: tuple[Tensor | Shared, ...]
+        alike: tuple[Tensor, ...] = ()  # numbers of the programs' tables
+        self._functions: tuple[Tensor, ...] = ()  # columns
         if isinstance(functions, OwnFunctions):
             self._functions = tuple(part.movedim(-1, 0).to(where) for part in functions)
         else:
             assert functions.rate is not None
-            alike = OwnFunctions.of(functions.rate.double().reshape(1), functions.offsets.unsqueeze(0))
-            self._functions = tuple(Shared(part[..., 0].to(where)) for part in alike)
+            told = OwnFunctions.of(functions.rate.double().reshape(1), functions.offsets.unsqueeze(0))
+            alike = tuple(part[..., 0].to(where) for part in told)
+        self._learn = shared_program("StaFRegressor.fit", _learning(*alike), *alike)
+        self._expect = shared_program("StaFRegressor.predict", _expecting(*alike), *alike)
         self._law = tuple(map(placed, law_of(definition)))
         self._lapse = torch.ones(state.streams, dtype=torch.float64, device=where)
 
     def predict(self, state: StreamState, x: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of the next y at x (S, n), of the table's dtype: (S, K)."""
-        row = self._functions, self._law, self._parts(state), x
-        mean, deviation = _EXPECT((), (), row, steps=1)[1]
+        row = self._functions, self._law, carry_of(state)[:3], x
+        mean, deviation = self._expect((), (), row, steps=1)[1]
         return mean[:, 0], deviation[:, 0]
 
     def learn(self, state: StreamState, x: Tensor, y: Tensor, lapse: Tensor | None = None) -> None:
@@ -123,13 +151,6 @@ class KernelFilter:
     def stretch(self, state: StreamState, x: Tensor, y: Tensor, lapse: Tensor) -> None:
         """Learn the samples of a stretch in one call: (T, S, n), (T, S, K), (T, S)."""
         now = tuple(part.transpose(0, 1) for part in (x, y, lapse))
-        carry = self._parts(state), tuple(state.counts.unbind())
-        (parts, counts), _ = _LEARN(carry, now, (self._functions, self._law))
-        state.put(*(part.movedim(0, -1).flatten(0, -2) for part in parts))
-        state.counts.copy_(torch.stack(counts))
-
-    def _parts(self, state: StreamState) -> tuple[Tensor, ...]:
-        """The rows of the table as the program has them: (S, ...)."""
-        pieces = state.table.split(state.heights)
-        shaped = [part.unflatten(0, (-1, state.count)) if k == 2 else part for k, part in enumerate(pieces)]
-        return tuple(part.movedim(-1, 0) for part in shaped)
+        (*parts, counts), _ = self._learn(carry_of(state), now, (self._functions, self._law))
+        state.put(*(part.mT for part in parts))
+        state.counts.copy_(counts.mT)

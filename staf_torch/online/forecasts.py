@@ -10,10 +10,10 @@ from torch import Tensor
 
 from ..lanes import Program
 from ..lanes.tree import Tree
-from .filter_program import FORECAST, after, law_of
+from .filter_program import FORECAST, after, carry_of, law_of
 from .kalman_filter import LocalFilter
 from .own_functions import OwnFunctions
-from .stream_state import Counts
+from .stream_state import StreamState
 
 
 class Forecast(NamedTuple):
@@ -59,11 +59,6 @@ def forecasts(filter_: LocalFilter, x: Tensor, y: Tensor, lapse: Tensor) -> tupl
 
 
 def _fresh(x: Tensor, y: Tensor, count: int) -> Tree:
-    """The carry of streams that have learned nothing: the parts of their state, and counts."""
+    """The carry of streams that have learned nothing."""
     (rows, _, n), k = x.shape, y.shape[-1]
-    new = x.detach().new_zeros
-    nowhere = x.detach().new_full((rows, n), math.nan)
-    lower = count * (count + 1) // 2
-    rest = [new(rows, k) for _ in range(7)]
-    parts = (nowhere, nowhere, new(rows, k + 1, count), new(rows, lower), *rest, new(rows, 1), new(rows, 1))
-    return parts, tuple(new(rows, dtype=torch.int64) for _ in Counts._fields)
+    return carry_of(StreamState.empty(x.detach(), rows, n, count, k))
