@@ -48,11 +48,9 @@ class Recipe(NamedTuple):
         if any(id(tensor) not in others for tensor in self.found):
             return None
         known = dict(others)
-        with torch.no_grad():
-            for function, args, kwargs, out in self.operations:
-                result = function(*_swapped(args, known), **_swapped(kwargs, known))
-                for old, new in zip(tensors(out), tensors(result), strict=True):
-                    known[id(old)] = new
+        with torch.no_grad(), torch._C.DisableTorchFunction():  # a default device concerns nothing here
+            for operation in self.operations:
+                _repeat(operation, known)
             if any(not _same(known.get(id(tensor), tensor), value) for tensor, value in self.checks):
                 return None
             return _joined([_read(known.get(id(tensor), tensor), at) for tensor, at in self.reads])
@@ -102,16 +100,12 @@ class TableSlopes:
         known = {id(found): each.detach() for found, each in zip(self._found, others, strict=True)}
         with torch.enable_grad():
             wanted = [known[id(tensor)].requires_grad_() for tensor in self._of]
-            for function, args, kwargs, out in self._operations:
-                given = [known.get(id(x), x) if isinstance(x, Tensor) else _swapped(x, known) for x in args]
+            for operation in self._operations:
+                function, args, _, out = operation
                 if function is torch.ops.aten.detach.default:  # of what autograd keeps; the same numbers
-                    known[id(out)] = given[0]
-                    continue
-                result = function(*given, **_swapped(kwargs, known)) if kwargs else function(*given)
-                if isinstance(out, Tensor):
-                    known[id(out)] = result
+                    known[id(out)] = _swapped(args[0], known)
                 else:
-                    known.update(zip(map(id, tensors(out)), tensors(result), strict=True))
+                    _repeat(operation, known)
             read = [(known[key].reshape(-1), at) for key, at in self._reads]
             numbers = [x if at is None else x[at.to(x.device)] for x, at in read]
             pairs = [(x, s.to(x)) for x, s in zip(numbers, by_numbers, strict=True) if x.requires_grad]
@@ -120,6 +114,17 @@ class TableSlopes:
             return [torch.zeros_like(x) for x in wanted]
         found = torch.autograd.grad(sums, wanted, allow_unused=True)
         return [torch.zeros_like(x) if y is None else y for x, y in zip(wanted, found, strict=True)]
+
+
+def _repeat(operation: Operation, known: dict[int, Tensor]) -> None:
+    """Run an operation with what stands in the place of its arguments, and note what it returned."""
+    function, args, kwargs, out = operation
+    given = [known.get(id(x), x) if isinstance(x, Tensor) else _swapped(x, known) for x in args]
+    result = function(*given, **_swapped(kwargs, known)) if kwargs else function(*given)
+    if isinstance(out, Tensor):
+        known[id(out)] = result
+    else:
+        known.update(zip(map(id, tensors(out)), tensors(result), strict=True))
 
 
 def _different(operations: Sequence[Operation]) -> tuple[list[Operation], dict[int, int]]:
