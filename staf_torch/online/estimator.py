@@ -248,7 +248,7 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         Raises:
             ValueError: if it is on another device than the first sample, and the streams take none there.
         """
-        if value.device != self._device_ and not self._streams_.moves:
+        if value.device != self._device_ and (value.is_meta or not self._streams_.moves):
             rule = f"must be on {self._device_}, where the first sample was"
             raise ValueError(f"`{self._call(call)}({name}=...)` {rule}; got one on {value.device}.")
         real = self._streams_.dtype
