@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import concurrent.futures
+import copy
 import functools
 import io
 import itertools
@@ -395,7 +396,17 @@ def nothing_waits() -> bool:
 
 def doors() -> dict[str, Callable[[], Any]]:
     """Functions of the library on tensors of the device, which give the same there as on the CPU."""
-    from staf_torch import adp, systems
+    from staf_torch import (
+        ExperienceMemory,
+        GaussianKernel,
+        StaFBasis,
+        StaFRegressor,
+        StateFollowingCenters,
+        adp,
+        rings,
+        systems,
+        targets,
+    )
 
     plant, cost = systems.TwoState(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
 
@@ -422,7 +433,27 @@ def doors() -> dict[str, Callable[[], Any]]:
         (end.square().sum() + angles.sum()).backward()
         return x.grad, gain.grad
 
-    return {"systems.simulate": simulated, "adp.simulate": closed, "a policy": policy, "a gradient": gradient}
+    def streams(device: str) -> Any:
+        x, found = x0(device, 3 * 64).unflatten(0, (3, 64)), []
+        for more in ({}, {"scaling": True}, {"noise": lanes.rows(0.01 + x0(device)[:, 0].abs())}):
+            model = StaFRegressor(GaussianKernel(1.0), 0.4, 3, **more).fit(x[:2], x[:2].sum(-1))
+            found += copy.deepcopy(model).partial_fit(x[2], x[2, :, 0]).predict(x[0], True)
+        return found
+
+    def remembered(device: str) -> Any:
+        basis = StaFBasis(GaussianKernel(1.0), StateFollowingCenters(rings(3), 0.3))
+        memory, x = ExperienceMemory(basis, 8, (64,)), x0(device)
+        for k in range(12):
+            memory.add(x + 0.1 * k, basis.local(x + 0.1 * k).fit(basis.values(x + 0.1 * k, targets.Paper())))
+        return memory(x.unsqueeze(1) + 1.0), memory.start(x + 1.0)
+
+    calls = {
+        "systems.simulate": simulated,
+        "adp.simulate": closed,
+        "a policy": policy,
+        "a gradient": gradient,
+    }
+    return calls | {"streams": streams, "a memory of local models": remembered}
 
 
 def same_there(call: Callable[[str], Any]) -> bool:

@@ -90,7 +90,7 @@ def where_held(
         def moved(*args: Given.args, **more: Given.kwargs) -> Found:
             owner, where = args[0], held(args[0]).device
             first = next((each for each in (*args[1:], *more.values()) if isinstance(each, Tensor)), None)
-            if first is None or first.device == where:
+            if first is None or first.device == where or first.is_meta:
                 return method(*args, **more)
             _say_moved(call, where, first.device)
             given: Any = tree_map_only(Tensor, lambda each: each.to(where), (args[1:], more))

@@ -117,7 +117,7 @@ class ExperienceMemory(nn.Module):
         """
         batch = self.stored.shape[:-1]
         for name, value, last in (("x", x, self.basis.dim), ("coefficients", coefficients, self.basis.count)):
-            if trailing("ExperienceMemory.add", name, value, 1, last).shape[:-1] != batch:
+            if trailing("ExperienceMemory.add", name, value, 1, last, meta=False).shape[:-1] != batch:
                 raise ValueError(
                     f"`ExperienceMemory.add({name}=...)` must have the shape {(*batch, last)}; "
                     f"got {tuple(value.shape)}."

@@ -34,6 +34,8 @@ def tensor_of(call: str, name: str, value: Any, *, recorded: bool = False) -> Te
             raise ValueError(
                 f"`{call}({name}=...)` must be a dense tensor of real numbers; got one that is {form}."
             )
+        if value.is_meta:
+            raise ValueError(f"`{call}({name}=...)` must have numbers; got a tensor on the device meta.")
         found = value if recorded else value.detach()
     else:
         try:

@@ -171,7 +171,7 @@ class GlobalValue(KeptPrecision):
     @without_gradient("GlobalValue", "x")
     def forward(self, x: Tensor) -> Tensor:
         """u: (..., n) -> (..., m)."""
-        trailing("GlobalValue", "x", x, 1, self.problem.dim)
+        trailing("GlobalValue", "x", x, 1, self.problem.dim, meta=False)
         if x.dtype != self.plans.dtype:
             return self.forward(x.to(self.plans.dtype)).to(x.dtype)
         rows = x if x.dim() == 2 else x.reshape(-1, x.shape[-1])
@@ -195,14 +195,14 @@ class GlobalValue(KeptPrecision):
     @where_held("GlobalValue", _held)
     def value(self, x: Tensor) -> Tensor:
         """V(x), inf where no plan covers x: (..., n) -> (...)."""
-        trailing("GlobalValue.value", "x", x, 1, self.problem.dim)
+        trailing("GlobalValue.value", "x", x, 1, self.problem.dim, meta=False)
         found = self.choose(x.reshape(-1, x.shape[-1]).to(self.plans.dtype))
         return torch.where(found.covered, found.value, torch.inf).reshape(x.shape[:-1]).to(x.dtype)
 
     @where_held("GlobalValue", _held)
     def gradient(self, x: Tensor) -> Tensor:
         """g_j + H_j d of the model that the best candidate starts at: (..., n) -> (..., n)."""
-        trailing("GlobalValue.gradient", "x", x, 1, self.problem.dim)
+        trailing("GlobalValue.gradient", "x", x, 1, self.problem.dim, meta=False)
         rows = x.reshape(-1, x.shape[-1]).to(self.plans.dtype)
         return self.model(rows).slope(self.problem, rows).reshape(x.shape).to(x.dtype)
 
