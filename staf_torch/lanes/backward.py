@@ -264,7 +264,8 @@ class Backward:
         table = self._adjoint.table
         if table is None:
             return [next(totals) for _ in self._of_captured]
-        return table(self._ran.read, [next(totals) for _ in table.runs])
+        found: list[Tensor] = table(self._ran.read, [next(totals) for _ in table.runs])
+        return found
 
     def _numbers(self, totals: Any) -> list[Tensor | None]:
         return [next(totals) if k in self._of_own else None for k in range(len(self._own))]
