@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from .. import adp
-from ..adp import ActorCritic, Controller, LoopResult
-from ..adp.loop.controller import Value
-from ..adp.loop.setup import AdpProblem
-from ..adp.planning.shooting.reference_optimum import known_value
 from ..approximation.basis import StaFBasis
 from ..figures.animation import FRAMES, KINDS, Curves, Scene, animate
 from ..numerics.checks import COMMAND_LINE, choice, fail
@@ -21,6 +17,11 @@ from ..results.run_directory import RunDirectory
 from ..settings.chase import ChaseProblem
 from ..settings.plain import PlainSettings
 from ..systems import Units
+
+if TYPE_CHECKING:  # `adp` is .1 s, which chases do not need
+    from ..adp import Controller, LoopResult
+    from ..adp.loop.controller import Value
+    from ..adp.loop.setup import AdpProblem
 
 _GRID, _ACROSS = 81, 41
 
@@ -86,6 +87,7 @@ def frames(last: int, power: int = 1) -> np.ndarray:
 
 def loop_scene(problem: AdpProblem, result: LoopResult) -> Scene:
     """Return the first trajectory of a closed loop: V is the optimal value, where a formula knows it."""
+    from ..adp.planning.shooting.reference_optimum import known_value
 
     def known(x: Tensor) -> Tensor:
         value = known_value(problem, x)
@@ -161,6 +163,8 @@ def _curves(result: LoopResult, at: np.ndarray) -> Curves:
 
 def _inner(controller: Controller) -> Controller:
     """Return what a supervisor or an identifying tracker holds."""
+    from .. import adp
+
     if isinstance(controller, adp.Supervised):
         return controller.controller
     return controller.learner if isinstance(controller, adp.IdentifyingTracker) else controller
@@ -168,10 +172,12 @@ def _inner(controller: Controller) -> Controller:
 
 def _moving(controller: Controller) -> StaFBasis | None:
     """Return kernel and centers of what follows the state in a controller."""
+    from .. import adp
+
     inner, basis = _inner(controller), None
     if isinstance(inner, adp.Feedback):
         basis = getattr(inner.policy, "basis", None)
-    elif isinstance(inner, ActorCritic):
+    elif isinstance(inner, adp.ActorCritic):
         value = inner.basis.basis if isinstance(inner.basis, adp.LeadingCoordinates) else inner.basis
         basis = value.basis if isinstance(value, adp.StaFValueBasis) else None
     return basis if isinstance(basis, StaFBasis) else None
@@ -179,8 +185,10 @@ def _moving(controller: Controller) -> StaFBasis | None:
 
 def _estimate(controller: Controller, points: Tensor, x: Tensor, critic: Tensor) -> Tensor | None:
     """Return V^(y; x) at points y (F, S, n) around the states x (F, n)."""
+    from .. import adp
+
     inner = _inner(controller)
-    if isinstance(inner, ActorCritic):
+    if isinstance(inner, adp.ActorCritic):
         around = x.unsqueeze(-2).expand(points.shape)
         estimate: Tensor = (inner.basis(points, around) * critic.unsqueeze(-2)).sum(-1)
         return estimate

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from torch import Tensor
 
-from ..adp import Controller, Cost, LoopResult, simulate
 from ..figures.style import images
 from ..results.run_directory import Printable, RunDirectory
 from ..systems import Plant
@@ -18,8 +17,10 @@ from ..tables import Style, Table
 from ..tables.columns import significant
 from .registry import Metrics, finite
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # `adp` is .1 s, which chases do not need
     from matplotlib.figure import Figure
+
+    from ..adp import Controller, Cost, LoopResult
 
 Drawing = Callable[[], "Figure"]
 _NAMED = 20  # diverged trajectories that the log lists by number
@@ -35,6 +36,8 @@ class Method(NamedTuple):
 
     def run(self, x0: Tensor, **shared: Any) -> LoopResult:
         """Run the closed loop from the states of the plant, (B, n)."""
+        from ..adp import simulate
+
         return simulate(self.controller, self.plant, self.cost, x0, **shared, **self.options)
 
 
