@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import tempfile
 from pathlib import Path
@@ -9,6 +10,14 @@ from pathlib import Path
 from staf_torch.lanes.emit.cuda import FEWER_REGISTERS
 
 ARCHITECTURES = (80, 90, 100)
+RECORDED = Path(__file__).with_name("benchmarks") / "registers.txt"
+
+
+def recorded(name: str, dtype: str, architecture: int) -> list[tuple[int, ...]]:
+    """What is recorded of the kernels of a case of `tests/gpu.py`: as `ptxas` returns it."""
+    lines = [line for line in RECORDED.read_text().splitlines() if line.startswith(f"{name:28} {dtype} ")]
+    found = (re.search(rf"sm_{architecture} (\d+) registers (\d+) spilled (\d+) stack", line) for line in lines)
+    return [tuple(map(int, each.groups())) for each in found if each is not None]
 
 
 def ptxas(text: str, architectures: tuple[int, ...] = ARCHITECTURES) -> dict[int, tuple[int, int, int]]:

@@ -9,10 +9,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import gpu_cases as cases
 import pytest
 import torch
 from recorded import Record
-from registers import ptxas
+from registers import ptxas, recorded
 from torch import Tensor
 
 from staf_torch import StaFBasis, adp, centers, chase_weights, kernels, lanes, optim, systems, targets
@@ -267,6 +268,33 @@ def test_kernels_compile_and_keep_their_numbers_in_registers(dtype: torch.dtype)
     for used, spilled, _ in ptxas(lanes.Program(flow).cuda_source(*given(2, dtype))).values():
         assert 0 < used < 255
         assert spilled == 0
+
+
+KERNELS = {
+    "M = 3 SteepestDescent, 100": cases.weights(3, "SteepestDescent", 100),
+    "M = 6 PreconditionedDescent": cases.weights(6, "PreconditionedDescent", 16),
+    "M = 15 jacobi": cases.weights(15, "jacobi", 16),
+    "M = 15 FixedStep": cases.weights(15, "FixedStep", 16),
+    "M = 15 RecursiveLeastSquares": cases.weights(15, "RecursiveLeastSquares", 16),
+    "information actor-critic": cases.information,
+}
+
+
+@pytest.mark.skipif(shutil.which("nvcc") is None, reason="no compiler of CUDA")
+@pytest.mark.parametrize("name", KERNELS)
+def test_kernels_spill_no_more_than_is_recorded(name: str) -> None:
+    """Of all there are, `python -m tests.gpu --ptxas` tells it, in minutes."""
+    torch.manual_seed(0)
+    dtype = torch.float32 if "Recursive" in name else torch.float64
+    case = KERNELS[name](3, dtype)
+    with lanes.compiling("always"), lanes.device.recorded() as texts:
+        case.call(*case.inputs)
+    known = recorded(name, str(dtype)[6:], 90)
+    assert len(known) == len(texts)
+    for text, (_, spilled, stack) in zip(texts, known, strict=True):
+        _, now, memory = ptxas(text, (90,))[90]
+        assert now <= spilled
+        assert memory <= stack
 
 
 # No step reads a tensor back to the host: on the meta device, which has no numbers, that would raise.
