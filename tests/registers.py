@@ -7,6 +7,7 @@ import subprocess
 import tempfile
 from pathlib import Path
 
+from staf_torch.lanes.device.cuda import fewer_is_better
 from staf_torch.lanes.emit.cuda import FEWER_REGISTERS
 
 ARCHITECTURES = (80, 90, 100)
@@ -16,16 +17,19 @@ RECORDED = Path(__file__).with_name("benchmarks") / "registers.txt"
 def recorded(name: str, dtype: str, architecture: int) -> list[tuple[int, ...]]:
     """What is recorded of the kernels of a case of `tests/gpu.py`: as `ptxas` returns it."""
     lines = [line for line in RECORDED.read_text().splitlines() if line.startswith(f"{name:28} {dtype} ")]
-    found = (re.search(rf"sm_{architecture} (\d+) registers (\d+) spilled (\d+) stack", line) for line in lines)
+    found = (
+        re.search(rf"sm_{architecture} (\d+) registers (\d+) spilled (\d+) stack", line) for line in lines
+    )
     return [tuple(map(int, each.groups())) for each in found if each is not None]
 
 
 def ptxas(text: str, architectures: tuple[int, ...] = ARCHITECTURES) -> dict[int, tuple[int, int, int]]:
-    """Registers, bytes spilled and bytes of stack of a kernel, by nvcc and ptxas; less stack is better."""
+    """Registers, bytes spilled and bytes of stack of a kernel, by nvcc and ptxas: the better of two ways."""
     found = _ptxas(text, architectures, ())
     spilling = tuple(each for each, (_, spilled, _) in found.items() if spilled)
     other = _ptxas(text, spilling, (FEWER_REGISTERS,)) if spilling else {}
-    return found | {each: of for each, of in other.items() if of[2] < found[each][2]}
+    better = {each: of for each, of in other.items() if fewer_is_better(found[each][:0:-1], of[:0:-1])}
+    return found | better
 
 
 def _ptxas(

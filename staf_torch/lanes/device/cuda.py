@@ -15,7 +15,7 @@ import itertools
 import logging
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -224,8 +224,8 @@ class Nvrtc:
     def compile(self, text: str, architecture: int) -> bytes:
         """Return machine code, or PTX of the latest that it knows where a card is newer.
 
-        What does not fit into registers is compiled once more for fewer, and the one with less memory of a
-        thread's own is taken: more bytes spilled, and read rarely, cost less than whole matrices there.
+        What does not fit into registers is compiled once more for fewer, and the better one is taken
+        (`fewer_is_better`).
         Where a few registers less let one more warp run beside the others it has those, if nothing is
         stored for it (six percent of a chase with three centers on an H200).
 
@@ -284,6 +284,14 @@ def _with_one_more_warp(registers: int) -> int:
     warps = _REGISTERS // (-(-max(registers, 1) // _STEP) * _STEP)
     most = _REGISTERS // (warps + 1) // _STEP * _STEP
     return most if warps < _WARPS and registers - most <= _STEP else 0
+
+
+def fewer_is_better(found: Sequence[int], fewer: Sequence[int]) -> bool:
+    """Return whether a kernel for fewer registers is better: bytes of a thread's memory, of them spilled.
+
+    Some numbers that are spilled, and read rarely, cost less than whole vectors in memory.
+    """
+    return fewer[0] < found[0] or (fewer[1] == 0 and 2 * fewer[0] <= 3 * found[0])
 
 
 @functools.cache

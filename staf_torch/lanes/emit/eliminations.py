@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Callable
 
@@ -72,7 +73,8 @@ class EliminationWriter(MatrixWriter):
         """Entries of row i0_0 of the solution."""
         read = self._sides(node)
         for c in range(width):
-            self._sums(node, f"r{c}", lambda j, c=c: read(1, f"(i0_1 + {c})", j))
+            for j in range(self.copies):
+                self._line(f"{self._type(node)} r{c}{self._copy(j)} = {read(1, f'(i0_1 + {c})', j)};")
         with self._over("i0_2", "0", "i0_0"):
             self._sums(node, "x", lambda j: read(0, "i0_2", j))
             for c, j in itertools.product(range(width), range(self.copies)):
@@ -127,14 +129,13 @@ class EliminationWriter(MatrixWriter):
 
     def _pack(self, node: int) -> None:
         """Write an array, unless it is there for a substitution alone, which reads what it is made of."""
-        reader = self._readers().get(node)
+        reader = self._readers.get(node)
         if reader is None or self._apart(reader) is None:
             super()._pack(node)
 
+    @functools.cached_property
     def _readers(self) -> dict[int, int]:
         """The substitutions, by what they read."""
         graph = self.graph
-        if "readers" not in self._index:
-            of = [n for n in self.schedule.live if graph.op[n] in ("substitute", "substitute_unit")]
-            self._index["readers"] = {graph.args[n][0]: n for n in of}
-        return self._index["readers"]
+        of = [n for n in self.schedule.live if graph.op[n] in ("substitute", "substitute_unit")]
+        return {graph.args[n][0]: n for n in of}

@@ -63,8 +63,9 @@ class ProductWriter(StatementWriter):
                     at = self._sum(u, [indices[k][0][0] or indices[k][0][1], indices[k][0][2]], indices[k][1])
                     self._line(f"const {kind} x{k}_{e}{self._copy(j)} = {self._read(operand, at, j)};")
 
-        def factors(r: int, c: int, j: int) -> list[str]:
-            return [f"x{k}_{r if by_row[k] else c}{self._copy(j)}" for k in range(2)]
+        def factors(r: int, c: int, j: int) -> tuple[str, str]:
+            first, second = (f"x{k}_{r if by_row[k] else c}{self._copy(j)}" for k in range(2))
+            return first, second
 
         for r, c, j in entries:
             self._line(f"{kind} r{r}_{c}{self._copy(j)};")

@@ -264,7 +264,27 @@ def taken_over(graph: Graph, schedule: Schedule) -> set[int]:
     return found
 
 
-_CHEAP = frozenset(["add", "sub", "mul", "neg", "abs", "min", "max", "where", "copy", "lt", "le", "eq", "ne", "and", "or", "xor", "not"])
+_CHEAP = frozenset(
+    [
+        "add",
+        "sub",
+        "mul",
+        "neg",
+        "abs",
+        "min",
+        "max",
+        "where",
+        "copy",
+        "lt",
+        "le",
+        "eq",
+        "ne",
+        "and",
+        "or",
+        "xor",
+        "not",
+    ]
+)
 _SHORT = 6  # operations of an entry that is made again
 
 
