@@ -202,6 +202,8 @@ def page(height: float) -> Iterator[Figure]:
             yield figure
             engine = figure.get_layout_engine()
             assert engine is not None
+            for axes in figure.axes:  # else numbers are chosen by the type of whoever prints the figure
+                axes.tick_params(labelsize=paper.size)
             _widen_the_constant(figure)
             _short_decades(figure)
             _label_the_lowest(figure)
