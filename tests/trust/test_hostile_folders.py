@@ -21,7 +21,7 @@ from sweep_runs import write_run
 from staf_torch.cli.deployable import deployable
 from staf_torch.cli.export import export
 from staf_torch.cli.table import main
-from staf_torch.deploy import sheet
+from staf_torch.deploy import data_sheet
 from staf_torch.experiments.registry import experiment
 from staf_torch.results.reader import collect
 from staf_torch.sweeps.hydra_compat.inside import HAS_WHITELIST
@@ -210,7 +210,7 @@ def test_the_name_of_a_folder_is_neither_c_nor_told_to_the_terminal(run: Path, t
     )
     moved = tmp_path / 'x"\n#pragma \x1b[2J'
     run.rename(moved)
-    page = sheet.markdown(export(moved, "c", calls=10))
+    page = data_sheet.markdown(export(moved, "c", calls=10))
     assert not (tmp_path / "owned").exists()
     assert "\x1b" not in page
     assert "pragma" in page
