@@ -16,6 +16,7 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import torch
 from command_line import ROOT, environment, in_a_child, one
 
 from staf_torch.cli import export, table
@@ -98,6 +99,7 @@ def keep(drawn: Path, name: str) -> None:
 
 
 def main(chosen: list[str]) -> None:
+    torch.set_num_threads(1)  # a fork has no threads of a pool, and would wait for them
     PICTURES.mkdir(exist_ok=True)
     pages = {
         path.stem: (path.read_text(encoding="utf-8"), f"{path.stem}.png") for path in guides()
