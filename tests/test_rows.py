@@ -492,7 +492,7 @@ def test_numbers_that_are_equal_in_all_rows_are_of_as_many_rows() -> None:
 
 ANYWHERE: dict[str, Callable[[Any], Callable[[Tensor], Tensor]]] = {
     "repeat": lambda k: lambda x: lanes.repeat(2, lambda c: c * k.sin(), x),
-    "torch.tensor": lambda k: lambda x: x * torch.tensor([k, 1.0]),
+    "torch.tensor": lambda k: lambda x: x * torch.tensor([k, 0.1]),
     "new_full": lambda k: lambda x: x + x.new_full(x.shape[1:], k),
     "derivative": lambda k: lambda x: torch.func.grad(lambda y: (k * y.sin()).sum())(x),
     "text": lambda k: lambda x: x * float(f"{k:.17g}"),

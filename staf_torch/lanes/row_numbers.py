@@ -335,24 +335,26 @@ class _Makes(TorchFunctionMode):
 
 
 def made_of_list(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Tensor | None:
-    """Return what `torch.tensor` makes of nested lists that hold tensors, in operations of torch; None of
-    another function."""
+    """Return what `torch.tensor` makes of lists with tensors, by operations; None of another function."""
     if getattr(func, "__name__", "") not in _MAKES or not args or not isinstance(args[0], list | tuple):
         return None
-    if not any(isinstance(leaf, Tensor) for leaf in tree_flatten(args[0])[0]):
+    leaves = tree_flatten(args[0])[0]
+    held = [leaf for leaf in leaves if isinstance(leaf, Tensor)]
+    if not held:
         return None
-    given = {name: kwargs.get(name) for name in ("dtype", "device")}
-    return torch.as_tensor(_stacked(args[0]), **given)
+    dtypes = (torch.as_tensor(x, device=getattr(x, "device", "cpu")).dtype for x in leaves)
+    dtype = kwargs.get("dtype") or functools.reduce(torch.promote_types, dtypes)
+    device = next((leaf.device for leaf in held if leaf.device.type != "cpu"), held[0].device)
+    return torch.as_tensor(_stacked(args[0], dtype, device), device=kwargs.get("device"))
 
 
-def _stacked(parts: Any) -> Tensor:
+def _stacked(parts: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Return nested lists of numbers and tensors as a tensor, of which operations are seen."""
-    if not isinstance(parts, list | tuple):
-        return parts if isinstance(parts, Tensor) else torch.as_tensor(parts, device="cpu")
-    found = [_stacked(part) for part in parts]
-    real = functools.reduce(torch.promote_types, (part.dtype for part in found))
-    device = next((part.device for part in found if part.device.type != "cpu"), None)
-    return torch.stack([part.to(device or part.device, real) for part in found])
+    if isinstance(parts, list | tuple):
+        return torch.stack([_stacked(part, dtype, device) for part in parts])
+    if isinstance(parts, Tensor):
+        return parts.to(device, dtype)
+    return torch.as_tensor(parts, dtype=dtype, device=device)
 
 
 def _decides(error: Exception) -> bool:
