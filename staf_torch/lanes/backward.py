@@ -115,19 +115,21 @@ class Backward:
     def _known(self, key: Hashable) -> Built | None:
         """Return what was built of the adjoint, now if there is nothing yet: of single numbers, or by
         `torch.func.vjp`."""
-        known = self._call.adjoints
-        if key not in known:
-            if len(known) >= _KNOWN:
-                known.clear()
-            carry, usual = self._deciding()
-            table, trace = None, self._ran.built.trace
-            if usual and trace.recipe.repeats:
-                table = TableSlopes(trace.recipe, [trace.recipe.found[k] for k in self._wanted()])
-                known[key] = self._planned(carry, table)
-            if table is None or self._build(key) is None:
-                known[key] = self._planned(carry, None)
-        self._adjoint = known[key]
-        return self._build(key)
+        known, built = self._call.adjoints, None
+        found: _Adjoint | None = known.get(key)
+        if found is not None:
+            return self._build(key, found)
+        carry, usual = self._deciding()
+        trace = self._ran.built.trace
+        if usual and trace.recipe.repeats:
+            table = TableSlopes(trace.recipe, [trace.recipe.found[k] for k in self._wanted()])
+            built = self._build(key, self._planned(carry, table))
+        if built is None:
+            built = self._build(key, self._planned(carry, None))
+        if len(known) >= _KNOWN:
+            known.clear()
+        known[key] = self._adjoint  # not before it is decided: other threads take what is there
+        return built
 
     def _wanted(self) -> list[int]:
         """Return the places of the captured tensors with a gradient among all that the trace found."""
@@ -158,9 +160,9 @@ class Backward:
         sums += [one(self._own[k], False) for k in self._of_own]
         return _Adjoint(self._ran.built.trace, form, table, sums, {})
 
-    def _build(self, key: Hashable) -> Built | None:
-        """Return what was built of the adjoint."""
-        call, ran, adjoint = self._call, self._ran, self._call.adjoints[key]
+    def _build(self, key: Hashable, adjoint: _Adjoint) -> Built | None:
+        """Return what was built of the adjoint, from now on that of this pass."""
+        call, ran = self._call, self._ran
         self._adjoint, few = adjoint, slice(0, min(call.rows, UNIT))
         program, place, trace = call.followers.get((key, adjoint.kind), (None, None, None))
         built = program.latest(place) if program is not None and trace is adjoint.trace else None
