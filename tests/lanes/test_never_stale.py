@@ -410,3 +410,22 @@ def test_a_function_is_compiled_once_its_calls_would_have_paid_for_it(rows: int,
         row(x)
         calls += 1
     assert most // 2 <= calls - 1 <= most
+
+
+@pytest.mark.parametrize("outside", [False, True])
+def test_what_a_step_writes_between_two_uses_is_read_as_it_was_then(outside: bool) -> None:
+    """Also where the numbers beside it change afterwards."""
+    weights, held = torch.tensor([2.0, 3.0]).double(), torch.zeros(2).double()
+
+    def step(x: Tensor, u: Tensor, row: object) -> tuple[Tensor, Tensor]:
+        buffer = held.zero_() if outside else torch.zeros(2).double()
+        buffer[0] = 1.0
+        first = (weights * buffer).sum()
+        buffer[1] = 2.0
+        return 0.1 * first * x + (weights * buffer).sum() + u, x
+
+    program, given = lanes.Program(step), (torch.ones(3).double(), torch.ones(3, 4).double())
+    for weight in (2.0, 5.0):
+        weights[0] = weight
+        with lanes.compiling("always"):
+            torch.testing.assert_close(program(*given)[0], program.definition(*given)[0])

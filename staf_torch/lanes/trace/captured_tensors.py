@@ -45,7 +45,7 @@ class Recipe(NamedTuple):
 
     def again(self, others: Mapping[int, Tensor]) -> Tensor | None:
         """The numbers with other tensors in place of those found; None where the program would be another."""
-        if any(id(tensor) not in others for tensor in self.found):
+        if not self.repeats or any(id(tensor) not in others for tensor in self.found):
             return None
         known = dict(others)
         with torch.no_grad(), torch._C.DisableTorchFunction():  # a default device concerns nothing here
@@ -170,6 +170,7 @@ class Captured:
         self._values: list[Tensor] = []  # read at once: memory may be written to later
         self._checks: list[tuple[Tensor, Any]] = []
         self._repeats = True
+        self._used = set[int]()  # storages that the step made and operations to be repeated read
         self._results: dict[Hashable, int] = {}  # operations that ran, and the storage of what they returned
         self._same: dict[int, int] = {}  # storages, and earlier ones that hold the same numbers
         self.count = 0
@@ -198,10 +199,12 @@ class Captured:
             elif not tensors(out):  # read in a way that cannot be checked
                 self._repeats = False
             self._operations.append((function, args, kwargs, out))
+            self._used.update(map(_address, given))
         if function._schema.is_mutable:
             for tensor in given:
                 self._forget(tensor)
-            self._repeats = self._repeats and stated
+            # What was read before would be read as it is written now.
+            self._repeats = self._repeats and stated and self._used.isdisjoint(map(_address, given))
         before = set(map(_address, given))
         for tensor in filter(_in_memory, tensors(out)):
             address, storage = _address(tensor), tensor.untyped_storage()
