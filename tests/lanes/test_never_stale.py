@@ -19,6 +19,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from staf_torch import lanes
 from staf_torch.lanes import compiled, ready
 from staf_torch.lanes.compiled_methods import CompiledMethod
 from staf_torch.lanes.contents import Contents
