@@ -263,6 +263,23 @@ def test_the_search_finds_a_method_and_asks_no_server(site: Path, tmp_path: Path
         assert {address.partition(":")[0] for address in browser.requests} <= {"file", "data", "blob"}
 
 
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here")
+def test_examples_of_the_front_page_stand_side_by_side_without_a_scroll_bar(
+    site: Path, tmp_path: Path
+) -> None:
+    (page,) = site.glob("*.*/front.html")
+    with Browser(tmp_path) as browser:
+        browser.open(page.as_uri())
+        blocks = "[...document.querySelectorAll('.beside pre > code')]"
+        assert browser.value(f"{blocks}.map(b => b.textContent.includes('import torch'))") == [True, True]
+        tops, *hidden = (
+            browser.value(f"{blocks}.map(b => {each})")
+            for each in ("b.getBoundingClientRect().top", "b.scrollWidth - b.clientWidth")
+        )
+        assert tops[0] == tops[1]
+        assert hidden == [[0, 0]]
+
+
 @pytest.mark.parametrize(
     ("text", "typeset_as"),
     [

@@ -94,6 +94,14 @@ def test_front_page_is_two_screens() -> None:
     assert len(lines) <= 150
 
 
+def test_examples_stand_side_by_side_within_the_column() -> None:
+    """GitHub's is 830 pixels where the window is 1280: 8.2 a character of code, 118 around two blocks."""
+    (cells,) = re.findall(r"^<table>.*?^.*</table>$", read(README), re.DOTALL | re.MULTILINE)
+    widest = [max(map(len, block.splitlines())) for _, _, block in guides.blocks(cells, ("python",))]
+    assert len(widest) == 2
+    assert 8.2 * sum(widest) + 118 <= 830
+
+
 def test_versions_are_those_of_the_last_run_of_the_matrix() -> None:
     """Of the front page and of the classifiers: the table of tests/README.md has them."""
     rows = [line for line in read(ROOT / "tests" / "README.md").splitlines() if " passed, " in line]

@@ -149,6 +149,7 @@ def _settings(folder: Path, rooms: Sequence[str]) -> dict[str, Any]:
         "markdown_extensions": [
             "admonition",
             "attr_list",
+            "md_in_html",
             "tables",
             {"toc": {"permalink": True, "toc_depth": 3}},
             "pymdownx.superfences",

@@ -17,6 +17,7 @@ _CHECKOUT = PACKAGE.parent
 _FRONT = PACKAGE / "guides" / "front"
 """In a wheel: README.md, CHANGELOG.md and the pictures of both."""
 _FENCE = re.compile(r"^(```.*?^```$)", re.DOTALL | re.MULTILINE)
+_TABLE = re.compile(r"^(?:</?(?:table|tr|td)\b[^>]*>)+$", re.MULTILINE)
 _LINK = re.compile(r"(!?)\[((?:[^][]|\[[^][]*\])*)\]\(([^()\s]+)\)")
 _MANUALS = ("README.md", "CHANGELOG.md", "runs/README.md", "tests/README.md", "tests/benchmarks")
 
@@ -106,7 +107,16 @@ def _linked(text: str, place: str, places: list[str], folder: Path, at: str | No
         return f"{picture}[{words}]({shown}{'#' + anchor if anchor else ''})"
 
     parts = _FENCE.split(text)
-    return "".join(part if part.startswith("```") else _LINK.sub(link, part) for part in parts)
+    return "".join(
+        part if part.startswith("```") else _TABLE.sub(_beside, _LINK.sub(link, part)) for part in parts
+    )
+
+
+def _beside(found: re.Match[str]) -> str:
+    """Return a line of an HTML table as blocks of Markdown, side by side where there is room."""
+    line = re.sub(r"<td[^>]*>", '<div markdown="1">', found[0]).replace("</td>", "</div>")
+    line = line.replace("<table>", '<div class="beside" markdown="1">').replace("</table>", "</div>")
+    return re.sub(r"</?tr>", "", line).replace("><", ">\n<")
 
 
 def _copied(place: str, folder: Path) -> bool:
