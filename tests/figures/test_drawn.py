@@ -155,7 +155,7 @@ def of_layouts() -> Drawn:
     shown = [([3, 6, 10, 15, 21], 1e-3 * np.arange(1, 6)), ([3], np.array([6e-3])), ([3], np.array([7e-3]))]
     shown += [(radii, errors[k]) for k in (0, 1, 2, 3, 5)]
     names = ["rings", "polygon", "simplex", "rings, 3: 2.00", *(f"rings, {n}: -" for n in (6, 10, 15))]
-    panels = [r"$\sup\,|V - \hat V|$ on the ball", ""]
+    panels = [r"$\sup\,|V - \hat V|$ on the ball"] * 2  # one below the other in a column
     return Drawn(theory.draw_layouts(found, 0.2, radii), shown, panels, [*names, "polygon, 3: -"])
 
 
@@ -176,17 +176,13 @@ FIGURES: dict[str, Callable[[], Drawn]] = {
 }
 
 
-@pytest.mark.parametrize("name", FIGURES)
-def test_a_figure_has_a_curve_for_all_that_it_was_given_and_names_it(name: str) -> None:
-    found = FIGURES[name]()
-    panels = visible(found.figure)
-    drawn = [line for axes in panels for line in lines(axes)]
-    assert [axes.get_ylabel() for axes in panels] == found.panels
-    assert [name for name, _, _ in drawn if name is not None] == found.names
-    for x, values in found.curves:
-        for y in np.asarray(values).reshape(len(values), -1).T:
-            here = [line for line in drawn if len(line[1]) == len(x) and np.allclose(line[1], x)]
-            assert any(np.allclose(line[2], y, equal_nan=True) for line in here), y
+CROWDED = FIGURES.keys() - {
+    "a chase of many centers",  # the others of a kind have more names in their legends
+    "a memory on a line",
+    "a loop of many functions",
+    "a feedback",
+}
+"""Those whose legends and names are looked at in a column of 3.4 inches, laid out."""
 
 
 def test_a_comparison_counts_states_up_to_a_multiple_of_the_optimal_cost() -> None:

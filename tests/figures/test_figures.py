@@ -13,8 +13,8 @@ import matplotlib
 import numpy as np
 import pytest
 from command_line import environment
-from figures.drawing import visible
-from figures.test_drawn import FIGURES
+from figures.drawing import lines, visible
+from figures.test_drawn import CROWDED, FIGURES
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from PIL import Image
@@ -54,11 +54,27 @@ def test_the_style_is_ours_whatever_the_caller_has_set_and_is_taken_back() -> No
 
 
 @pytest.mark.parametrize("name", FIGURES)
-def test_in_a_column_a_figure_has_type_of_8_pt_and_legends_in_its_axes_of_lines_that_are_seen(
-    name: str,
+def test_a_figure_has_a_curve_for_all_that_it_was_given_and_names_it(
+    name: str, request: pytest.FixtureRequest
 ) -> None:
+    if name not in CROWDED:
+        request.getfixturevalue("not_laid_out")
     with printed_on(FigurePaper.of({"width": 3.4})):
-        figure = FIGURES[name]().figure
+        found = FIGURES[name]()
+    panels = visible(found.figure)
+    drawn = [line for axes in panels for line in lines(axes)]
+    assert [axes.get_ylabel() for axes in panels] == found.panels
+    assert [name for name, _, _ in drawn if name is not None] == found.names
+    for x, values in found.curves:
+        for y in np.asarray(values).reshape(len(values), -1).T:
+            here = [line for line in drawn if len(line[1]) == len(x) and np.allclose(line[1], x)]
+            assert any(np.allclose(line[2], y, equal_nan=True) for line in here), y
+    if name in CROWDED:
+        fits_a_column(found.figure)
+
+
+def fits_a_column(figure: Figure) -> None:
+    """Type of 8 pt, all ink on the paper, and legends in their axes, of lines that are seen."""
     width, height = figure.get_size_inches()
     assert width == 3.4
     assert height < 9.5  # inches: a page

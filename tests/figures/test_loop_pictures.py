@@ -19,6 +19,8 @@ from staf_torch.figures.style import page
 
 pytest.importorskip("scipy", reason="the LQR needs the extra adp")
 
+pytestmark = pytest.mark.usefixtures("not_laid_out")
+
 
 class Integrator(systems.ControlAffineSystem):
     """A plant of a user's own, without a name for anything."""
@@ -81,7 +83,6 @@ def run(case: Any, policy: Any = None) -> adp.LoopResult:
     return adp.simulate(policy, plant, cost, x0.double(), dt=0.05, steps=20, compile=False)
 
 
-@pytest.mark.usefixtures("not_laid_out")
 @pytest.mark.parametrize("case", CASES)
 def test_a_closed_loop_is_drawn_with_units_bounds_and_the_lqr_beside(case: Any) -> None:
     result = run(case)
@@ -107,7 +108,6 @@ def test_a_closed_loop_is_drawn_with_units_bounds_and_the_lqr_beside(case: Any) 
     assert len(wanted) == (case is tracking)
 
 
-@pytest.mark.usefixtures("not_laid_out")
 @pytest.mark.parametrize("rest", [-0.5, 3.0])
 def test_a_control_that_differs_by_rounding_has_an_axis_of_its_size(rest: float) -> None:
     figure = run(pendulum, lambda x: rest + 1e-12 * x[..., :1]).figure(lqr=False)

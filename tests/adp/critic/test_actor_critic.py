@@ -243,7 +243,7 @@ def test_actor_critic_regulates_within_bounds(kind: str) -> None:
     cost = {"hard": hard, "smooth": smooth}[kind]
     control = adp.ActorCritic(staf_basis(), PLANT, cost, adp.RandomPoints(1, BOX))
     run = adp.simulate(
-        control, PLANT, cost, drawn(6, 0.7, seed=3), dt=0.02, steps=300, every=100, compile=False
+        control, PLANT, cost, drawn(6, 0.7, seed=3), dt=0.04, steps=150, every=50, compile=False
     )
     u = run.control[:, :-1]
     assert ((u >= -1.0) & (u <= 1.3)).all()

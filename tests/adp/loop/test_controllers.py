@@ -220,7 +220,10 @@ def test_supervisor_regulates_a_grid_of_initial_weights() -> None:
     assert float(regulated.double().mean()) >= 0.95
 
 
-def test_bounds_that_a_controller_was_made_with_are_those_of_its_loop() -> None:
+def test_bounds_that_a_controller_was_made_with_are_those_of_its_loop(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("matplotlib.layout_engine.ConstrainedLayoutEngine.execute", lambda *_: None)
     plant, cost = systems.Pendulum(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
     x0 = torch.tensor([[0.3, 0.0]], dtype=torch.float64)
     policy = adp.LQR(plant, cost.bounded(-6.0, 8.0))

@@ -81,7 +81,7 @@ def test_a_unicycle_parks_sideways() -> None:
     cost = adp.QuadraticCost([1.0, 1.0, 0.1], 0.1, dim=3, inputs=2, low=-1.0, high=1.0, terminal=5.0)
     x0 = tensor([[0.0, 0.4, 0.0]])
     shot = adp.DirectShooting(Unicycle(), cost, horizon=1.4, intervals=10, iterations=30, starts=2).solve(x0)
-    still = float(adp.simulate(lambda x: 0 * x[..., :2], Unicycle(), cost, x0, dt=0.1, steps=14).cost) + 0.8
+    still = 1.4 * 0.4**2 + 5 * 0.4**2  # what standing where it is costs
     plan = adp.BoxDDP(adp.SampledProblem.of(Unicycle(), cost, dt=0.1), steps=14, compile=False).solve(x0)
     assert float(shot.value) < 0.6 * still
     torch.testing.assert_close(plan.cost, shot.value, rtol=0.02, atol=0.0)
@@ -129,8 +129,10 @@ def short_plan(**terminal: float) -> Tensor:
     return adp.BoxDDP(problem, steps=10, compile=False).solve(x0).cost
 
 
-@pytest.mark.parametrize("terminal", [torch.eye(2).double(), 1.0, lambda x: x.square().sum(-1)])
-@pytest.mark.parametrize("of", ["problem", "cost"])
+@pytest.mark.parametrize(
+    ("of", "terminal"),
+    [("problem", torch.eye(2).double()), ("cost", 1.0), ("cost", lambda x: x.square().sum(-1))],
+)
 def test_a_terminal_cost_is_a_matrix_a_number_or_a_function_everywhere(of: str, terminal: Any) -> None:
     plant, x0 = systems.Pendulum(), tensor([[0.3, 0.0], [-0.2, 0.1]])
     plain = adp.QuadraticCost(1.0, 0.5, 2, 1)
@@ -153,7 +155,6 @@ def test_doors_that_lead_to_a_goal_refuse_a_problem_without_one() -> None:
 
 CONSTANT: list[Callable[[Tensor], Tensor]] = [
     lambda x: 0 * x[..., 0],
-    lambda x: x.new_zeros(x.shape[:-1]),
     lambda x: torch.full(x.shape[:-1], 2.0, dtype=x.dtype),
 ]
 

@@ -47,10 +47,10 @@ def test_with_one_iteration_a_control_the_loop_comes_to_the_optimum_within_bound
 
 
 def test_short_plan_that_ends_in_the_memory_swings_up(memory: adp.GlobalValue) -> None:
-    mpc = adp.RecedingHorizon(memory.problem, steps=20, memory=memory)
-    controls, last = drive(mpc, RESETS, 120)
+    mpc, starts = adp.RecedingHorizon(memory.problem, steps=20, memory=memory), [2, 4, 6]
+    controls, last = drive(mpc, RESETS[starts], 100)
     assert float(memory.problem.terminal(last).max()) < 1e-2
-    assert float(cost_of(memory.problem, RESETS, controls).mean() / GRID.mean()) < 1.01
+    assert float(cost_of(memory.problem, RESETS[starts], controls).mean() / GRID[starts].mean()) < 1.01
 
 
 def test_one_plan_of_the_memory_is_followed_up(memory: adp.GlobalValue) -> None:
