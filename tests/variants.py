@@ -218,13 +218,6 @@ PREDICTORS: dict[str, predictors.Predictor | None] = {
     "tangent, order 1": predictors.Tangent(order=1),
     "tangent, order 2": predictors.Tangent(),
 }
-# Every law, and every predictor with one law of each kind of state.
-PAIRS = [(law, "none") for law in LAWS] + [
-    (law, predictor)
-    for predictor in PREDICTORS
-    for law in ("steepest descent", "heavy ball", "recursive least squares")
-    if predictor != "none"
-]
 PAPER_LAW = "steepest descent"
 
 

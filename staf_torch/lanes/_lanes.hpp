@@ -12,7 +12,11 @@
 #else
 #define LANES_BYTES 16
 #endif
+#ifdef __NO_INLINE__  // by -O0, where a copy for every call is what takes time to compile
+#define INLINE_METHOD inline
+#else
 #define INLINE_METHOD inline __attribute__((always_inline))
+#endif
 #define INLINE static INLINE_METHOD
 #if defined(__AVX512F__) && !defined(__clang__)
 #define LANES_512 1

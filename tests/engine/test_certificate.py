@@ -8,7 +8,7 @@ import math
 import pytest
 import torch
 from helpers_laws import TARGET, basis, states
-from variants import LAWS, PREDICTORS, RATED, SMOOTH_KERNELS, SYSTEMS
+from variants import LAWS, PREDICTORS, RATED, SMOOTH_KERNELS, SYSTEMS, by_turns
 
 from staf_torch import StaFBasis, StateFollowingCenters, StateRadius, chase, optim, rings, theory
 from staf_torch.engine import ChaseResult
@@ -28,18 +28,18 @@ def certified(
     )
 
 
-# Every kernel, every system and every law, in half of their pairs.
+# Every kernel with a law and a system in their turn.
 @pytest.mark.parametrize(
     ("law", "steps", "kernel", "system"),
     [
         (
-            *(("steepest descent", 10), ("fixed step", 3), ("conjugate gradient", 2))[(k + s) % 3],
+            *(("steepest descent", 10), ("fixed step", 3), ("conjugate gradient", 2))[k // 3 % 3],
             kernel,
             system,
         )
         for k, kernel in enumerate(SMOOTH_KERNELS)
         for s, system in enumerate(SYSTEMS)
-        if (k + s) % 2 == 0
+        if (k + s) % 3 == 0
     ],
 )
 def test_the_one_step_bound_holds_on_every_system_and_kernel(
@@ -54,10 +54,9 @@ def test_the_one_step_bound_holds_on_every_system_and_kernel(
     assert bool((result.excess.clamp(min=0).sqrt() <= certificate.bound * (1 + 1e-9) + rounding).all())
 
 
-@pytest.mark.parametrize("predictor", PREDICTORS)
-@pytest.mark.parametrize("law", RATED)
+@pytest.mark.parametrize(("predictor", "law"), by_turns(PREDICTORS, list(RATED)))
 def test_the_one_step_bound_holds_for_every_law_with_a_rate_and_every_predictor(
-    law: str, predictor: str
+    predictor: str, law: str
 ) -> None:
     certificate = certified(law, 2, predictor=predictor).certificate
     assert certificate is not None
@@ -114,16 +113,16 @@ def test_the_a_priori_radius_holds_on_every_system_and_kernel(
     dt, steps, law = 0.02, 15, optim.SteepestDescent()
     radius = StateRadius(0.3, 0.5) if shrinking else 0.2
     local = StaFBasis(SMOOTH_KERNELS[kernel].make(), StateFollowingCenters(rings(3), radius))
-    x = states(batch=2, steps=190, dt=dt, system=system)
+    x = states(batch=2, steps=90, dt=dt, system=system)
     constants = theory.drift_constants(local, TARGET, x, SYSTEMS[system]().drift(x))
     bound = theory.ultimate_bound(constants, law, dt=dt, inner_steps=steps)
     assert math.isfinite(bound.before)
     result = chase(x, local, TARGET, law, inner_steps=steps)
     q = float(law.contraction(torch.tensor(constants.condition_number))) ** (steps / 2)
-    left = float(result.excess_before[:, 0].max().sqrt()) * (q * math.exp(constants.growth * dt)) ** 150
+    left = float(result.excess_before[:, 0].max().sqrt()) * (q * math.exp(constants.growth * dt)) ** 60
     sampling = 1.02  # the constants are taken at the states alone, not between them
-    assert float(result.excess_before[:, 150:].max().sqrt()) <= sampling * math.sqrt(bound.before) + left
-    assert float(result.excess[:, 150:].max().sqrt()) <= sampling * math.sqrt(bound.after) + left
+    assert float(result.excess_before[:, 60:].max().sqrt()) <= sampling * math.sqrt(bound.before) + left
+    assert float(result.excess[:, 60:].max().sqrt()) <= sampling * math.sqrt(bound.after) + left
 
 
 @functools.cache

@@ -71,7 +71,11 @@ def test_result_is_what_its_fields_say(name: str, law: str) -> None:
 
 @pytest.mark.parametrize(("name", "inner_steps"), by_turns(KERNELS, [1, 10]))
 def test_excess_contracts_at_every_time_of_the_run(name: str, inner_steps: int) -> None:
-    basis, states, rule = basis_of(name, count=3, radius=0.3), orbit(*STARTS, steps=63), LAWS[PAPER_LAW]
+    basis, states, rule = (
+        basis_of(name, count=3, radius=0.3),
+        orbit(*STARTS, dt=0.1, steps=16),
+        LAWS[PAPER_LAW],
+    )
     result = st.chase(states, basis, Paper(), rule, inner_steps=inner_steps)
     rate = rule.contraction(condition_number(basis.gram(states)))
     if rate is None:
@@ -84,9 +88,9 @@ def test_excess_contracts_at_every_time_of_the_run(name: str, inner_steps: int) 
 
 @pytest.mark.parametrize(("name", "radius"), by_turns(KERNELS, [0.3, st.StateRadius(0.5, 0.1)]))
 def test_rows_are_as_they_would_be_alone(name: str, radius: object) -> None:
-    basis, states = basis_of(name, count=6, radius=radius), orbit(*STARTS, steps=12)
+    basis, states = basis_of(name, count=6, radius=radius), orbit(*STARTS, steps=5)
     together = fields(st.chase(states, basis, Paper(), SteepestDescent()))
-    for row in (0, 3):
+    for row in (3,):
         alone = fields(st.chase(states[row : row + 1], basis, Paper(), SteepestDescent()))
         for key in ("weights", "coefficients", "estimate", "estimate_before", "value", "state"):
             torch.testing.assert_close(together[key][row], alone[key][0], rtol=1e-12, atol=1e-12)
@@ -96,16 +100,16 @@ def test_rows_are_as_they_would_be_alone(name: str, radius: object) -> None:
 
 @pytest.mark.parametrize(("name", "poison"), by_turns(KERNELS, [torch.nan, torch.inf]))
 def test_a_row_that_is_not_finite_freezes_alone_and_is_reported(name: str, poison: float) -> None:
-    basis, states = basis_of(name, count=3), orbit(*STARTS)
+    basis, states = basis_of(name, count=3), orbit(*STARTS, steps=10)
     clean = fields(st.chase(states, basis, Paper(), SteepestDescent()))
     states = states.clone()
-    states[1, 17:] = poison
-    states[3, 5, 0] = poison  # finite again afterwards: it stays frozen all the same
+    states[1, 7:] = poison
+    states[3, 3, 0] = poison  # finite again afterwards: it stays frozen all the same
     found = fields(st.chase(states, basis, Paper(), SteepestDescent()))
-    assert found["diverged_at"].tolist() == [-1, 17, -1, 5]
+    assert found["diverged_at"].tolist() == [-1, 7, -1, 3]
     for key, value in found.items():
         assert torch.equal(value[[0, 2]], clean[key][[0, 2]]), key
-    for row, first in ((1, 17), (3, 5)):
+    for row, first in ((1, 7), (3, 3)):
         assert torch.equal(found["weights"][row, :first], clean["weights"][row, :first])
         for key in ("estimate", "value", "excess", "ideal_weights", "coefficients"):
             assert torch.isfinite(found[key][row, :first]).all(), key
@@ -124,10 +128,10 @@ def test_a_target_that_is_not_finite_somewhere_freezes_only_the_row_that_goes_th
 
 
 @pytest.mark.parametrize("kernel", ["exponential", "user_defined"])
-@pytest.mark.parametrize("sizes", [[1] * 41, [5, 1, 35], [40, 1]])
+@pytest.mark.parametrize("sizes", [[1] * 13, [5, 1, 7]])
 def test_the_length_of_pieces_does_not_change_the_result(sizes: list[int], kernel: str) -> None:
-    states, basis = orbit(*STARTS), basis_of(kernel, count=3, radius=0.3)
-    states[2, 11:] = torch.inf
+    states, basis = orbit(*STARTS, steps=12), basis_of(kernel, count=3, radius=0.3)
+    states[2, 9:] = torch.inf
     whole = fields(run(states, kernel))
     pieces = chase_pieces(states.split(sizes, dim=1), basis, Paper(), SteepestDescent())
     for key, value in fields(concatenate(pieces)).items():

@@ -23,7 +23,11 @@ typedef float __m256 __attribute__((vector_size(32)));
 #ifndef REAL
 #define REAL double
 #endif
+#ifdef __NO_INLINE__  // by -O0, where a copy for every call is what takes time to compile
+#define INLINE static inline
+#else
 #define INLINE static inline __attribute__((always_inline))
+#endif
 typedef double V __attribute__((vector_size(64)));
 typedef int64_t Mask __attribute__((vector_size(64)));  // lanes of 0 or -1
 constexpr int lanes = 8, n = DIM, M = COUNT, K = OUTPUTS;
