@@ -17,9 +17,9 @@ TURN = 2 * math.pi
 
 def stream(rows: int = 2) -> tuple[Tensor, Tensor, Tensor]:
     """An angle that goes on, the same in [-pi, pi], and what is learned: (T, S, 2) twice, (T, S)."""
-    time = torch.arange(120).double()
+    time = torch.arange(50).double()
     angle = 0.15 * time[:, None] + torch.arange(rows).double()
-    other = 0.3 * uniform(120, rows, seed=1).cumsum(0) / 5
+    other = 0.3 * uniform(50, rows, seed=1).cumsum(0) / 5
     wrapped = torch.remainder(angle + math.pi, TURN) - math.pi
     return torch.stack((angle, other), -1), torch.stack((wrapped, other), -1), angle.sin() + other
 
@@ -58,5 +58,5 @@ def test_records_states_and_streams_that_come_and_go_know_the_turn() -> None:
     assert torch.equal(both.predict(torch.stack((at[1], at[1])))[0], again.predict(at)[1])
     with pytest.raises(ValueError, match="periodic"):
         StaFRegressor(periodic=[2]).fit(wrapped, y)
-    tuned = StaFRegressor(periodic=[0]).tune(wrapped[:60], y[:60])
+    tuned = StaFRegressor(periodic=[0]).tune(wrapped[:20], y[:20])
     assert tuned.fit(wrapped, y).predict(at).shape == (2,)

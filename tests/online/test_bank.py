@@ -157,8 +157,14 @@ def test_no_streams_have_no_predictions() -> None:
 
 
 @pytest.mark.parametrize("kind", ["definition", pytest.param("compiled", marks=needs_compiler)])
-@pytest.mark.parametrize("given", [(0.5, torch.inf), (torch.nan, torch.nan), (0.5, 0.5)])
-@pytest.mark.parametrize("told", [(1.0, -torch.inf), (torch.nan, torch.nan), (torch.nan, 1.0)])
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ((0.5, inf), (nan, 1.0)),
+        ((nan, nan), (nan, 1.0)),
+        *(((0.5, 0.5), y) for y in ((1.0, -inf), (nan, nan), (nan, 1.0))),
+    ],
+)
 def test_a_sample_with_nothing_to_learn_is_skipped_and_does_no_harm(
     kind: str, given: tuple[float, float], told: tuple[float, float]
 ) -> None:

@@ -69,8 +69,10 @@ def states(steps: int) -> dict[str, Tensor]:
 
 
 @pytest.mark.needs_compiler
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@pytest.mark.parametrize(("robust", "own"), [(INF, False), (2.0, False), (2.0, True)])
+@pytest.mark.parametrize(
+    ("robust", "own", "dtype"),
+    [(INF, False, torch.float64), (2.0, False, torch.float64), (2.0, True, torch.float32)],
+)
 def test_compiled_filter_is_its_definition(robust: float, own: bool, dtype: torch.dtype) -> None:
     follow(CompiledFilter, robust, own, dtype, 6)
 
