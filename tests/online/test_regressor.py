@@ -91,18 +91,18 @@ def test_basis_is_orthonormal_in_the_native_space(kernel: str) -> None:
 def test_around_one_anchor_the_filter_is_gaussian_process_regression(kernel: str) -> None:
     """u | y of y = psi'u + rest + noise in one solve, the rests independent."""
     frame, ratio = frame_of(kernel), 1e-3
-    z, y = 0.3 * uniform(2, 20, seed=4), uniform(20, seed=5)
+    z, y = 0.3 * uniform(2, 8, seed=4), uniform(8, seed=5)
     state = StreamState.empty(torch.zeros(0).double(), 1, 2, 6, 1)
     filter_ = LocalFilter(frame, tensor([ratio]), tensor([1.0]), slack=1.0)
     filter_.learn(state, SEVERAL[:, :1].mT, tensor([[0.0]]))  # the first sample says where the centers are
     parts = state.parts(state.table)
     nothing = changed(parts, mean=torch.zeros_like(parts.mean), learned=torch.zeros_like(parts.learned))
     state.put(state.whole(nothing))
-    for k in range(20):
+    for k in range(8):
         filter_.learn(state, (SEVERAL[:, :1] + z[:, k : k + 1]).mT, y[k : k + 1, None])
-    x = SEVERAL[:, :1].expand(2, 20)
+    x = SEVERAL[:, :1].expand(2, 8)
     log_factor = frame.log_factor(x, z)
-    factor = torch.ones(20, dtype=torch.float64) if log_factor is None else log_factor.exp()
+    factor = torch.ones(8, dtype=torch.float64) if log_factor is None else log_factor.exp()
     psi = frame.functions(x, z) * factor
     rest = frame.variance(x, z) * factor.square() - psi.square().sum(0) + ratio
     covariance = psi.mT @ psi + rest.diag()
@@ -113,7 +113,7 @@ def test_around_one_anchor_the_filter_is_gaussian_process_regression(kernel: str
     torch.testing.assert_close(state.learned[..., 0], expected, rtol=1e-7, atol=1e-8)
 
 
-@pytest.mark.parametrize("kernel", ["exponential", "gaussian", "user_defined"])
+@pytest.mark.parametrize("kernel", ["gaussian", "user_defined"])
 def test_drifting_functions_are_predicted(kernel: str) -> None:
     x, y = walks(8, 80)
     model = st.StaFRegressor(KERNELS[kernel].make(), radius=0.4, noise=0.05)
@@ -176,7 +176,7 @@ def test_samples_that_are_not_finite_are_skipped_and_counted() -> None:
 
 @pytest.mark.parametrize("kernel", ["gaussian", "user_defined"])
 def test_prediction_before_a_sample_changes_nothing_of_what_is_learned(kernel: str) -> None:
-    x, y = walks(4, 30)
+    x, y = walks(4, 12)
     plain, asked = (st.StaFRegressor(KERNELS[kernel].make(), 0.3, noise=0.05) for _ in range(2))
     for k, (state, value) in enumerate(zip(x, y, strict=True)):
         if k:
@@ -233,8 +233,7 @@ def test_nothing_winds_up_in_a_stream_that_stands_still() -> None:
     assert 0 < float(deviation) < 0.1
 
 
-@pytest.mark.parametrize("jump", [3.0, 30.0])
-@pytest.mark.parametrize("kernel", ["exponential", "gaussian", "polynomial"])
+@pytest.mark.parametrize(("kernel", "jump"), [("exponential", 3.0), ("gaussian", 30.0), ("polynomial", 30.0)])
 def test_jump_leaves_a_stream_that_learns_on(kernel: str, jump: float) -> None:
     x, y = walks(2, 20)
     model = learned(st.StaFRegressor(KERNELS[kernel].make(), 0.3, noise=0.05), x, y)

@@ -24,13 +24,14 @@ def drawn(width: Tensor, noise: float, steps: int = 220, seed: int = 0) -> tuple
     return x, clean + noise * torch.randn(steps, generator=draw, dtype=torch.float64)
 
 
-def errors(model: st.StaFRegressor, x: Tensor, y: Tensor) -> float:
+def errors(model: st.StaFRegressor, x: Tensor, y: Tensor) -> Tensor:
+    """Root mean square, of every stream."""
     found = []
     for k in range(len(x)):
         if k > 20:
             found.append(model.predict(x[k]) - y[k])
         model.partial_fit(x[k], y[k])
-    return float(torch.stack(found).square().mean().sqrt())
+    return torch.stack(found).square().mean(0).sqrt()
 
 
 def test_tuned_regressor_predicts_as_one_that_knows_what_the_stream_was_drawn_with() -> None:
@@ -61,13 +62,14 @@ def test_each_coordinate_and_each_stream_has_its_own_width() -> None:
 def test_streams_that_drift_forget_and_others_do_not() -> None:
     x, y = drawn(torch.tensor([0.7, 0.7]).double(), 0.05)
     drift = y + (0.15 * torch.arange(len(y), dtype=torch.float64)).sin() * x[:, 0]
-    tuned = st.StaFRegressor().tune(x[:, None].expand(-1, 2, -1), torch.stack((y, drift), 1))
+    both = x[:, None].expand(-1, 2, -1), torch.stack((y, drift), 1)
+    tuned = st.StaFRegressor().tune(*both)
     found = tuned.tuning
     assert found is not None
     gains = (1 - found.forgetting) / found.ratio  # what a stream forgets between samples beside their noise
     assert float(gains[1]) > 3 * float(gains[0])
     never = st.StaFRegressor(st.GaussianKernel(0.7), 0.35, noise=0.05, forgetting=1.0)
-    assert errors(st.StaFRegressor().tune(x, drift), x, drift) < 0.85 * errors(never, x, drift)
+    assert errors(tuned, *both)[1] < 0.85 * errors(never, x, drift)
 
 
 def test_tuning_knows_no_units_and_is_saved_with_what_was_learned() -> None:
@@ -152,10 +154,10 @@ def test_stretch_in_which_a_coordinate_hardly_moves_says_so_and_nothing_about_it
 
 
 def test_tuning_of_a_stream_is_the_same_whoever_is_beside() -> None:
-    pairs = [drawn(torch.tensor([0.7, 0.7]).double(), 0.1, steps=60, seed=seed) for seed in range(7)]
+    pairs = [drawn(torch.tensor([0.7, 0.7]).double(), 0.1, steps=60, seed=seed) for seed in range(3)]
     x, y = (torch.stack([pair[k] for pair in pairs], 1) for k in range(2))
     together = st.StaFRegressor().tune(x, y).tuning
-    alone = {k: st.StaFRegressor().tune(x[:, k], y[:, k]).tuning for k in (1, 6)}
+    alone = {k: st.StaFRegressor().tune(x[:, k], y[:, k]).tuning for k in (2,)}
     assert together is not None
     for k, own in alone.items():
         assert own is not None
@@ -167,7 +169,8 @@ def test_samples_that_no_candidate_explains_do_not_choose() -> None:
     x, y = drawn(torch.tensor([0.7, 0.7]).double(), 0.1, steps=300, seed=40)
     broken = y.clone()
     broken[torch.tensor([70, 71, 110])] += torch.tensor([40.0, -30.0, 40.0]).double()
-    found = [errors(st.StaFRegressor().tune(x[:150], each[:150]), x, y) for each in (y, broken)]
+    x, told = x[:, None].expand(-1, 2, -1), torch.stack((y, broken), 1)
+    found = errors(st.StaFRegressor().tune(x[:150], told[:150]), x, y[:, None].expand(-1, 2))
     assert found[1] < 1.7 * found[0]  # 4.4 to 6.5 with a Gaussian density alone
 
 
