@@ -16,13 +16,12 @@ from torch import Tensor, nn
 
 from ..adp import Controller
 from ..lanes import Program
-from ..lanes.call_inputs import Given
 from ..lanes.compiler import run
 from ..lanes.emit.c import commented
 from ..lanes.emit.identifiers import checked_names, guarded
+from ..lanes.row_c import RowC, wide
 from ..lanes.row_objects import refuse_rows, row_of
-from ..lanes.trace.graph import WIDE
-from ..lanes.trace.step import trace
+from ..lanes.trace.step import Step
 from ..lanes.trace.tracer import NotLoweredError
 from ..lanes.tree import Tree, flatten, labels
 from ..numerics.checks import fail
@@ -86,8 +85,12 @@ def export_c(
         said = _said(note, source, f"compares {compared} states and takes at most")
         path.write_text(commented(said) + guarded(name, body), encoding="utf-8")
         return _warned(source, path, ahead)
-    program = Program(lambda carry, now, row: (carry, as_tuple(module(row["state"]))), name="the header")
-    return _warned(_write(path, program, (), {"state": example[:1]}, name, outputs, note), path, ahead)
+    given = _row_c((), {"state": example[:1]}, _step_of, module)
+    return _warned(_write(path, given, name, outputs, note), path, ahead)
+
+
+def _step_of(module: nn.Module) -> Step:
+    return lambda carry, now, row: (carry, as_tuple(module(row["state"])))
 
 
 def _warned(source: Source, path: Path, ahead: bool) -> Source:
@@ -157,40 +160,51 @@ def export_learning_c(
     if controller.draws:
         inputs["uniform"] = x0.new_zeros(1, controller.draws, x0.shape[-1])
 
-    def step(carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
-        uniform = row.get("uniform", x0.new_zeros(1, 0, x0.shape[-1]))
-        u, after = controller.step(row["x"], carry, uniform, dt)
-        return after, (u,)
+    def make(learner: Controller) -> Step:
+        def step(carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
+            uniform = row.get("uniform", x0.new_zeros(1, 0, x0.shape[-1]))
+            u, after = learner.step(row["x"], carry, uniform, dt)
+            return after, (u,)
 
-    return _write(path, Program(step, name="the header"), carry, inputs, name, ["u"], note)
+        return step
+
+    return _write(path, _row_c(carry, inputs, make, controller), name, ["u"], note)
 
 
-def _write(
-    path: Path, program: Program, carry: Tree, row: Tree, name: str, outputs: Sequence[str], note: str
-) -> Source:
-    source, count = _counted(program, carry, row)
-    check_count("export_c", outputs, count)
-    text = program.c_source(name, carry, (), row, outputs=outputs, note=_said(note, source, "takes at most"))
-    path.write_text(text, encoding="utf-8")
+def _row_c(carry: Tree, row: Tree, make: Callable[..., Step], part: object) -> RowC:
+    """Return the step that is made of a part, traced for C.
+
+    Raises:
+        ValueError: if it has no C.
+    """
+    try:
+        found = Program(make(part), name="the header").row_c(carry, (), row, [part], make)
+    except NotLoweredError as error:
+        raise ValueError(f"This has no C here, export it as ONNX, pt2 or aoti: {error}") from error
+    if wide(found.traced):
+        raise ValueError("This needs float64 inside, or float32 loses its digits: use --dtype float64.")
+    return found
+
+
+def _write(path: Path, given: RowC, name: str, outputs: Sequence[str], note: str) -> Source:
+    source = counted(given.traced)
+    check_count("export_c", outputs, len(given.traced.outputs))
+    path.write_text(given.text(name, outputs, _said(note, source, "takes at most")), encoding="utf-8")
     return source
 
 
 def _searching(module: nn.Module, x: Tensor, name: str, output: str) -> tuple[str, Source, int]:
     """Return the text of a policy that searches a memory, or is around one, its cost, and states compared."""
     if isinstance(module, RememberedPolicy):
-        program, row = module.program(), module.row(x)
-        one, _ = _counted(program, (), row)
-        follow = program.c_source(f"{name}_follow", (), (), row, outputs=["cost", "control"])
+        given = _row_c((), module.row(x), type(module).step, module)
+        follow, one = given.text(f"{name}_follow", ["cost", "control"]), counted(given.traced)
         return module.c_text(name, follow, output), module.source(one), len(module.searched)
     assert isinstance(module, FilteredPolicy | SupervisedPolicy)
     inner = x[:, : module.plant_size] if isinstance(module, FilteredPolicy) else x
     body, source, compared = _searching(module.policy, inner, f"{name}_policy", "control")
     row = {"state": x, "wanted": module.policy(inner)}
-    program = Program(
-        lambda c, _, row: (c, (module.restrained(row["state"], row["wanted"]),)), name="a filter"
-    )
-    more, _ = _counted(program, (), row)
-    text = program.c_source(f"{name}_restrained", (), (), row, outputs=["control"])
+    given = _row_c((), row, _restraint_of, module)
+    text, more = given.text(f"{name}_restrained", ["control"]), counted(given.traced)
     real, size, inputs = _c_type(x.dtype), x.shape[-1], row["wanted"].shape[-1]
     lines = [
         f"static inline void {name}(const {real} state[{size}], {real} {output}[{inputs}])",
@@ -201,15 +215,8 @@ def _searching(module: nn.Module, x: Tensor, name: str, output: str) -> tuple[st
     return "\n".join([body, text, *lines]), whole, compared
 
 
-def _counted(program: Program, carry: Tree, row: Tree) -> tuple[Source, int]:
-    """Return what a call costs, and the number of outputs."""
-    try:
-        traced = trace(program.step, Given.of(carry, (), row, 1), folded=True)
-    except NotLoweredError as error:
-        raise ValueError(f"This has no C here, export it as ONNX, pt2 or aoti: {error}") from error
-    if traced.program[0].single and WIDE in traced.program[0].type:
-        raise ValueError("This needs float64 inside, or float32 loses its digits: use --dtype float64.")
-    return counted(traced), len(traced.outputs)
+def _restraint_of(module: FilteredPolicy | SupervisedPolicy) -> Step:
+    return lambda carry, _, row: (carry, (module.restrained(row["state"], row["wanted"]),))
 
 
 def _said(note: str, source: Source, takes: str) -> str:

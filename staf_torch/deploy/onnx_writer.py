@@ -116,7 +116,7 @@ class OnnxWriter:
         def seen(carry: Tree, _: Tree, row: Tree) -> tuple[Tree, Tree]:
             return carry, (module.seen(row["x"]),)
 
-        place, follow = traced_row(seen, {"x": x}), traced_row(module.program().step, module.row(x))
+        place, follow = traced_row(seen, {"x": x}), traced_row(module.step(), module.row(x))
         assert place is not None
         assert follow is not None
         ((at, _),) = self.program(place, [state])

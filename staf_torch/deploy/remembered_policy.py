@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from ..adp import GlobalValue
 from ..adp.planning.global_value import follow_plan
-from ..lanes import Program
+from ..lanes.trace.step import Step
 from ..lanes.tree import Tree
 from ..numerics.checks import hold
 from .scalar_program import Source
@@ -96,22 +96,22 @@ class RememberedPolicy(nn.Module):
         tables = sum(getattr(self, name).numel() for name in ("plans", "models", "searched"))
         return Source(tables + one.constants, plans * one.flops + compared, plans * one.functions)
 
-    def program(self) -> Program:
-        """Evaluate a candidate from a state, (1, n), as a row program."""
+    def step(self) -> Step:
+        """Return what evaluates a candidate from a state, (1, n), as the step of a row program."""
 
         def step(carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
             given = row["x"], row["window"], row["end"]
             return carry, follow_plan(self.problem, self.region, self.worst, *given)[:2]
 
-        return Program(step, name="a plan that is followed")
+        return step
 
     def row(self, x: Tensor) -> dict[str, Tensor]:
-        """Return the inputs of `program` for the first candidate and a state (1, n)."""
+        """Return the inputs of `step` for the first candidate and a state (1, n)."""
         window = self.plans[self.first[:1].expand(self.lookahead)].unsqueeze(0)
         return {"x": x, "window": window, "end": self.models[:1]}
 
     def c_text(self, name: str, follow: str, output: str) -> str:
-        """Return a header's text: tables, ``follow`` of `program` as ``NAME_follow``, and the search."""
+        """Return a header's text: tables, ``follow`` of `step` as ``NAME_follow``, and the search."""
         real = "float" if self.plans.dtype == torch.float32 else "double"
         n, m = self.problem.dim, self.problem.inputs
         floats = ("plans", "models", "searched", "frame")

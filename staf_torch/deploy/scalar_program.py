@@ -12,12 +12,13 @@ from torch import Tensor
 from ..lanes.call_inputs import Given
 from ..lanes.emit.schedule import Schedule
 from ..lanes.row_independence import doubt
+from ..lanes.trace.graph import FIXED
 from ..lanes.trace.step import Step, Traced, trace
 from ..lanes.trace.tracer import NotLoweredError
 from .data_sheet import Work
 
 _CHEAP = set("add sub mul div lt le eq ne and or xor neg abs min max not where sqrt".split())  # noqa: SIM905
-_FREE = set("const elem result collect carry state row now load pack cast loop".split())  # noqa: SIM905
+_FREE = set("const param elem result collect carry state row now load pack cast loop".split())  # noqa: SIM905
 
 
 class Source(NamedTuple):
@@ -45,7 +46,7 @@ def counted(traced: Traced) -> Source:
     constants = flops = functions = 0
     for node in schedule.live:
         op, count = graph.op[node], schedule.repeats(node)
-        constants += op == "const"
+        constants += op in FIXED
         if op in ("map", "dot"):
             aux = graph.aux[node]
             count *= math.prod(aux[1]) if op == "map" else 2 * aux[0] * aux[1]

@@ -15,7 +15,6 @@ from .call import Compiled, form, ordinary, served
 from .call_inputs import Given, one_precision, whole
 from .compiler import machine_code
 from .contents import Contents, Derived
-from .emit.c import Names, c_text
 from .emit.cpp import emit
 from .locks import Mutex
 from .log import say
@@ -23,13 +22,14 @@ from .loops import scan, tracing_now
 from .one_thread import ENTRIES, alone
 from .opaque import opaque
 from .prepared_call import Prepared
+from .row_c import RowC
 from .row_independence import doubt, undrawn
 from .row_numbers import over_rows, points_of_rows
 from .texts import Built, Form, kernel, known
 from .trace.step import Step, trace
 from .trace.step_copy import NoReverseError
 from .trace.tracer import NotLoweredError
-from .tree import Shared, Tree, flatten, labels, plain, unflatten
+from .tree import Shared, Tree, flatten, plain, unflatten
 
 Some = TypeVar("Some", bound=Tensor)
 _FEW = 8  # rows that one vector holds
@@ -270,7 +270,8 @@ class Program(Derived):
         ``NAME_start(state)`` sets the carry to the numbers of row 0 of ``carry``;
         ``NAME(state, now..., row..., out...)`` advances it and writes the outputs. Without a carry there is
         no ``state``. Arguments are called as the keys of a dictionary or the fields of a named tuple, else
-        ``carry0``, ``now``, ``out1``, ...
+        ``carry0``, ``now``, ``out1``, ... What the step captured is the table ``NAME_numbers``, constant as
+        long as ``NAME_NUMBERS`` is not defined to be something else.
 
         Args:
             name: of the function.
@@ -282,17 +283,14 @@ class Program(Derived):
             NotLoweredError: if an operation has no scalar form, or the step is more than a function of a row.
             ValueError: if a name is not one of C, or is there twice.
         """
+        return self.row_c(carry, now, row).text(name, outputs, note)
+
+    def row_c(self, carry: Tree, now: Tree, row: Tree, *known: Any) -> RowC:
+        """Return the step of one row traced for C; ``known`` as in `RowC.of`."""
         given = Given.of(carry, now, row, 1)
         if not self._alone(given):
             raise NotLoweredError(f"its step {self._refused}")
-        traced = trace(self.step, given, folded=True)
-        kinds = {"row": given.structures["row"], "now": given.structures["now"]}
-        kinds |= {"carry": given.structures["carry"], "out": traced.structure}
-        found = [labels(structure, kind) for kind, structure in kinds.items()]
-        rows, nows, carries, ends = found
-        names = Names(rows, nows, carries, ends if outputs is None else outputs)
-        start = [float(x) for leaf in given.carry for x in leaf[0].reshape(-1).tolist()]
-        return c_text(*traced.program, name=name, names=names, start=start, note=note)
+        return RowC.of(self.step, given, *known)
 
     def find(self, given: Given) -> Compiled | None:
         """The compiled program for such inputs, None where there is none."""

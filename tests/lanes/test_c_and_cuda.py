@@ -162,11 +162,12 @@ def test_a_header_starts_with_the_first_row_and_has_the_names_of_its_trees() -> 
     given = carry, torch.ones(2, 4, 2).double(), {"gain": torch.ones(2, 1).double()}
     text = lanes.Program(moved).c_source("go", *given, note="a word")
     assert " * a word\n" in text
-    for part in ("state->x[0] = 0.5;", "state->x[1] = 2.0;", "const double now[2]", "const double gain[1]"):
+    assert "0.5, /* 0: x[0] at the start */\n    2.0, /* 1: x[1] at the start */" in text
+    for part in ("state->x[1] = go_numbers[1];", "const double now[2]", "const double gain[1]"):
         assert part in text
     assert "double out0[2], double out1[2])" in text
     named = lanes.Program(moved).c_source("go", *given, outputs=["a", "b"])
-    assert "/*" not in named
+    assert named.startswith("#ifndef GO_H")
     assert "double a[2], double b[2])" in named
 
 

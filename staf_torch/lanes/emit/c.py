@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from typing import ClassVar, NamedTuple
 
-from ..trace.graph import FLAG, NARROW, REAL, ROW, STEP, WHOLE, WIDE, Graph
+from ..trace.graph import FIXED, FLAG, NARROW, REAL, ROW, STEP, WHOLE, WIDE, Graph
 from .eliminations import EliminationWriter
 from .identifiers import checked_names, guarded
 from .schedule import Schedule, Sizes
@@ -22,6 +22,16 @@ class Names(NamedTuple):
     nows: Sequence[str]
     carries: Sequence[str]
     outputs: Sequence[str]
+
+
+class CTable(NamedTuple):
+    """Numbers that stand in the table of a C text: the parameters of a graph, and what each is called."""
+
+    values: Sequence[float] = ()
+    said: Sequence[str] = ()
+
+
+NO_NUMBERS = CTable()
 
 
 def random_numbers(lines: Sequence[str], real: str, qualifiers: str) -> list[str]:
@@ -142,6 +152,90 @@ class ScalarWriter(EliminationWriter):
 
 
 class _CWriter(ScalarWriter):
+    def __init__(
+        self, graph: Graph, schedule: Schedule, layout: Sizes, names: Names, table: str, numbers: CTable
+    ) -> None:
+        super().__init__(graph, schedule, layout, names)
+        self._name, self._numbers = table, numbers
+        self._places: dict[int, int] = {}  # in the table, of parameters of the graph
+        self._packs: dict[int, int] = {}  # of arrays, where they begin
+        self._numbered: list[int] = []  # the node of every place
+        self._lay_out()
+
+    def _lay_out(self) -> None:
+        """Find a place for every parameter: those of an array side by side, as far as they can be."""
+        graph, live = self.graph, sorted(self.schedule.live)
+        fixed = [
+            n for n in live if graph.op[n] == "pack" and all(graph.op[a] in FIXED for a in graph.args[n])
+        ]
+        for pack in fixed:
+            numbers = [graph.aux[node] for node in graph.args[pack] if graph.op[node] == "param"]
+            free = len({*numbers}) == len(numbers) and self._places.keys().isdisjoint(numbers)
+            if numbers and free and not self._wide(pack):
+                self._packs[pack] = len(self._numbered)
+                self._enter(graph.args[pack])
+        held = [node for pack in fixed for node in graph.args[pack]]
+        params = {node for node in (*live, *held) if graph.op[node] == "param" and not self._wide(node)}
+        numbered = sorted(params, key=lambda node: int(graph.aux[node]))
+        self._enter([node for node in numbered if graph.aux[node] not in self._places])
+
+    def _enter(self, nodes: Sequence[int]) -> None:
+        for place, node in enumerate(nodes, len(self._numbered)):
+            if self.graph.op[node] == "param":
+                self._places[self.graph.aux[node]] = place
+        self._numbered += nodes
+
+    def _wide(self, node: int) -> bool:
+        """Return whether the table, of floats, has not the digits of a number."""
+        return self.graph.single and self.graph.type[node] == WIDE
+
+    def _literal(self, node: int) -> str:
+        if self.graph.op[node] != "param":
+            return super()._literal(node)
+        number = self.graph.aux[node]
+        if self._wide(node):
+            return self._number(self._numbers.values[number], WIDE)
+        return f"{self._name}[{self._places[number]}]"
+
+    def _table(self, pack: int, at: str) -> str:
+        nodes = self.graph.args[pack]
+        if all(self.graph.op[node] == "const" for node in nodes):
+            return super()._table(pack, at)
+        if (first := self._packs.get(pack)) is not None:
+            return f"{self._name}[{f'{first} + {at}' if first else at}]"
+        if (name := f"c{pack}") not in self._arrays:  # its numbers lie elsewhere, in another order
+            self._arrays.add(name)
+            entries = ", ".join(map(self._literal, nodes))
+            self._lines.insert(1, f"    const {self._type(pack)} {name}[] = {{{entries}}};")
+        return f"{name}[{at}]"
+
+    @property
+    def entries(self) -> int:
+        """How many numbers of the program are in the table."""
+        return len(self._numbered)
+
+    def table(self, name: str, more: CTable) -> list[str]:
+        """Return the table and what may be defined for it; ``more`` are numbers behind the parameters."""
+        known, graph = self._numbers, self.graph
+        values, said = [], []
+        for node in self._numbered:
+            stated = graph.value(node)
+            values.append(known.values[graph.aux[node]] if stated is None else float(stated))
+            said.append(known.said[graph.aux[node]] if stated is None else "of the code")
+        values, said = [*values, *more.values], [*said, *more.said]
+        if not values:
+            return []
+        macro = f"{name.upper()}_NUMBERS"
+        texts = [self._number(value, REAL) for value in values]
+        texts = [text[1:-1] if text.startswith("(-") else text for text in texts]
+        return [
+            *(_ABOUT % {"name": name, "macro": macro}).splitlines(),
+            f"{macro} {self.real} {self._name}[{len(texts)}] = {{",
+            *_commented_rows(texts, said),
+            "};",
+            "",
+        ]
+
     def _buffer(self, op: str, place: int, j: int, at: str = "0") -> str:
         slot, entry = self._slot(op, place)
         return f"{self._names[op][slot]}[{entry if at == '0' else f'{entry} + {at}' if entry else at}]"
@@ -173,6 +267,30 @@ class _CWriter(ScalarWriter):
         return f"({self.real}){self._ref(node, 0)}" if self.graph.type[node] == FLAG else self._ref(node, 0)
 
 
+def _commented_rows(texts: Sequence[str], said: Sequence[str]) -> list[str]:
+    """Return the entries of a table, one a line; several where one comment is that of all."""
+    lines, first = list[str](), 0
+    while first < len(texts):
+        last = first + 1
+        while last < min(first + _A_LINE, len(texts)) and said[last] == said[first]:
+            last += 1
+        what = f": {said[first]}" if not first or said[first] != said[first - 1] else ""
+        lines.append(f"    {', '.join(texts[first:last])}, /* {first}{what} */")
+        first = last
+    return lines
+
+
+_A_LINE = 8
+_ABOUT = """/*
+ * The numbers of %(name)s. They are constants of which a compiler computes what follows, as long as nothing
+ * else is defined before this file is included: `#define %(macro)s static` lets a program write to the
+ * table while it runs, `static const volatile __attribute__((section(".calibration")))` a tool to flash.
+ */
+#ifndef %(macro)s
+#define %(macro)s static const
+#endif"""
+
+
 def c_text(
     graph: Graph,
     layout: Sizes,
@@ -183,25 +301,30 @@ def c_text(
     names: Names,
     start: Sequence[float],
     note: str = "",
+    numbers: CTable = NO_NUMBERS,
 ) -> str:
     """Return a C99 header with one step of a program: it needs math.h, and no memory but the stack.
 
     The carry is ``struct NAME_state``, which ``NAME_start`` sets to its first numbers and ``NAME`` advances.
+    What the program captured, and those first numbers, are the table ``NAME_numbers``.
     All numbers, flags and integers too, are double (float for a program of float32).
 
     Raises:
         ValueError: if a name is not one of C, or is there twice.
     """
-    inputs, stays = [*names.rows, *names.nows], ["state"] if names.carries else []
-    checked_names("c_source", "name", [name], [*inputs, *stays, *names.outputs])
+    table = f"{name}_numbers"
+    inputs, stays = [*names.rows, *names.nows], [*(["state"] if names.carries else []), table]
+    checked_names("c_source", "name", [name], [*inputs, *stays[:-1], *names.outputs])
     checked_names("c_source", "row", inputs, [*stays, "p", "q"])  # indices of loops
     checked_names("c_source", "carry", list(names.carries), field=True)
     if len(names.outputs) != len(layout.outputs):
         rule = f"must be {len(layout.outputs)} names, one an output"
         raise ValueError(f"`c_source(outputs=...)` {rule}; got {list(names.outputs)}.")
     checked_names("c_source", "outputs", list(names.outputs), [*inputs, *stays])
-    writer = _CWriter(graph, Schedule(graph, following, outputs), layout, names)
+    writer = _CWriter(graph, Schedule(graph, following, outputs), layout, names, table, numbers)
+    places = [(n, e) for n, size in zip(names.carries, layout.carries, strict=True) for e in range(size)]
     real, lines = writer.real, ["#include <math.h>", ""]
+    lines += writer.table(name, CTable(start, [f"{n}[{e}] at the start" for n, e in places]))
     arguments = [f"{name}_state *state"] if names.carries else []
     if names.carries:
         fields = zip(names.carries, layout.carries, strict=True)
@@ -211,11 +334,8 @@ def c_text(
             f"}} {name}_state;",
         ]
         lines += ["", f"static inline void {name}_start({name}_state *state)", "{"]
-        places = [(n, e) for n, size in zip(names.carries, layout.carries, strict=True) for e in range(size)]
-        lines += [
-            f"    state->{n}[{e}] = {writer._number(x, REAL)};"
-            for (n, e), x in zip(places, start, strict=True)
-        ]
+        first = writer.entries
+        lines += [f"    state->{n}[{e}] = {table}[{k}];" for k, (n, e) in enumerate(places, first)]
         lines += ["}", ""]
     for given, sizes in ((names.nows, layout.nows), (names.rows, layout.rows)):
         arguments += [f"const {real} {n}[{size}]" for n, size in zip(given, sizes, strict=True)]

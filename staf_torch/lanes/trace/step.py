@@ -83,7 +83,9 @@ class Traced(NamedTuple):
     rows: tuple[RowNumbers, ...]  # whose columns follow what a row has once
 
 
-def trace(step: Step, given: Given, *, widened: bool = False, folded: bool = False) -> Traced:
+def trace(
+    step: Step, given: Given, *, widened: bool = False, folded: bool = False, kept: Sequence[Tensor] = ()
+) -> Traced:
     """Write down what a step does with a single row.
 
     Args:
@@ -91,6 +93,7 @@ def trace(step: Step, given: Given, *, widened: bool = False, folded: bool = Fal
         given: inputs.
         widened: whether the numbers of a float32 program are carried in double.
         folded: whether the numbers of captured tensors become part of the text.
+        kept: captured tensors of which the text has what follows from them, too, and not the table.
 
     Raises:
         NotLoweredError: if an operation has no scalar form.
@@ -100,6 +103,8 @@ def trace(step: Step, given: Given, *, widened: bool = False, folded: bool = Fal
 
     own = _OwnNumbers(tracer, len(given.row), folded)
     with torch.no_grad():
+        for tensor in kept:
+            tracer.attach(tensor, tracer.nodes(tensor))
         row = given.tree("row", _inputs(tracer, "row", given.row, 0, 0))
         now = given.tree("now", _inputs(tracer, "now", given.now, NOW, 1))
         carry = _inputs(tracer, "state", given.carry, STEP, 0)
