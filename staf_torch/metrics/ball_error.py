@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -82,10 +84,10 @@ class StateErrorPass:
         found = self._compiled(x, coefficients, ideal) if self._pays() else None
         if found is not None:
             return found
-        width = self._points * self._basis.count
-        times = max(1, _BLOCK // (width * max(1, x.numel() // x.shape[-1] // x.shape[-2])))
+        width = self._points * self._basis.count * max(1, x.numel() // x.shape[-1] // x.shape[-2])
+        times, at = max(1, _BLOCK // width), functools.partial(self._at, pieces=-(-width // _BLOCK))
         blocks = zip(*(part.split(times, dim=-2) for part in (x, coefficients, ideal)), strict=True)
-        errors = [self._counted(next(blocks)), *(over_rows(self._at, *block) for block in blocks)]
+        errors = [self._counted(at, next(blocks)), *(over_rows(at, *block) for block in blocks)]
         columns = zip(*errors, strict=True)
         return StateErrors(*(torch.cat(column, dim=-1) for column in columns))
 
@@ -120,17 +122,21 @@ class StateErrorPass:
         pays = states >= _PAYS or states * self._share >= 1
         return worth(pays) if self._compile == "auto" else bool(self._compile)
 
-    def _counted(self, block: tuple[Tensor, ...]) -> StateErrors:
+    def _counted(self, at: Callable[..., StateErrors], block: tuple[Tensor, ...]) -> StateErrors:
         """The errors at the first states, and how long they take."""
         if self._share or not undecided(self._compile):
-            return over_rows(self._at, *block)
+            return over_rows(at, *block)
         with PlainTime() as plain:
-            errors = over_rows(self._at, *block)
+            errors = over_rows(at, *block)
         self._share = plain.seconds() / plain.build / max(1, errors.ball_error.numel())
         return errors
 
-    def _at(self, x: Tensor, coefficients: Tensor, ideal: Tensor) -> StateErrors:
-        """The definition, in which no state sees another: (..., n), (..., M), (..., M)."""
+    def _at(self, x: Tensor, coefficients: Tensor, ideal: Tensor, *, pieces: int = 1) -> StateErrors:
+        """The definition, in which no state sees another: (..., n), (..., M), (..., M).
+
+        Args:
+            pieces: in which the points of the ball are gone through, for less memory.
+        """
         basis, target, fixed = self._basis, self._target, self._fixed
         assert fixed is not None
         nu, offsets = basis.centers.radius(x)[..., None, None], basis.centers.offsets(x)
@@ -149,7 +155,7 @@ class StateErrorPass:
                 ideal = (cardinal * fitted.unsqueeze(-2)).sum(-1) * gain
             return torch.stack(((value - estimate).abs(), (value - ideal).abs()), dim=-1)
 
-        worst = reduce(errors, fixed.over(x), "max", dim=x.dim() - 1)
+        worst = fixed.largest(errors, x, pieces)
         kappa = condition_number(basis.gram_structure(x).scaled())
 
         def local(z: Tensor) -> Tensor:
@@ -208,10 +214,13 @@ class _Fixed(NamedTuple):
             cardinal = torch.stack(functions, dim=-1)
         return cls(probes, basis.kernel.core(origin, z, basis.centers.offsets(origin)), cardinal)
 
-    def over(self, x: Tensor) -> Any:
-        """With as many dimensions as points at the states x."""
+    def largest(self, body: Callable[[Any], Tensor], x: Tensor, pieces: int) -> Tensor:
+        """Return the largest of what ``body`` computes at the points, at states x: (..., n) to (..., 2)."""
 
         def along(part: Tensor | None) -> Tensor | None:
             return None if part is None else part[(None,) * (x.dim() + 1 - part.dim())]
 
-        return tuple(map(along, self))
+        size = -(-len(self.probes) // pieces)
+        parts = [[None] * pieces if part is None else part.split(size, dim=-2) for part in map(along, self)]
+        found = [reduce(body, points, "max", dim=x.dim() - 1) for points in zip(*parts, strict=False)]
+        return functools.reduce(torch.maximum, found)
