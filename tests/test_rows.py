@@ -320,6 +320,26 @@ def test_rows_of_several_kinds_stand_behind_one_filter() -> None:
                 assert torch.equal(got[row : row + 1], want)
 
 
+def test_rows_whose_brakes_hold_and_rows_whose_brakes_do_not_stand_behind_one_filter() -> None:
+    masses, x0 = torch.tensor([0.5, 3.0, 8.0]).double(), torch.tensor([[-0.3, -0.9]]).double()
+
+    def safe(mass: Any) -> adp.SafetyFilter:
+        plant = systems.Pendulum(mass=mass)
+        lqr = adp.LQR(plant, adp.QuadraticCost(1.0, 1.0, 2, 1))
+        return adp.SafetyFilter(lqr, plant, lambda x, t: x[:, 0] + 0.5, dt=0.1, low=-10.0, high=10.0)
+
+    many, x = safe(st.rows(masses)), torch.cat((x0, 0.5 * x0, x0 - 1.0)).unsqueeze(1).expand(-1, FEW, -1)
+    with lanes.compiling("never"):
+        singles = [safe(mass) for mass in masses]
+        found = [many.restrain(at, many.controller.policy(at)) for at in x]
+        for row, one in enumerate(singles):
+            for at, those in zip(x[:, row : row + 1], found, strict=True):
+                for got, want in zip(those, one.restrain(at, one.controller.policy(at)), strict=True):
+                    assert torch.equal(got[row : row + 1], want)
+    assert [one.follows for one in singles] == [False, True, True]  # two kinds, that are one program
+    assert any(bool((each.slack > 0).any()) for each in found)
+
+
 def test_a_row_without_an_optimum_spoils_no_other_and_says_why() -> None:
     plant, cost = systems.Pendulum(mass=st.rows(spread(*MASSES))), adp.QuadraticCost(1.0, 1.0, 2, 1)
     x0, shooting = 0.3 * starts(FEW), adp.DirectShooting(plant, cost, horizon=0.5, intervals=4)

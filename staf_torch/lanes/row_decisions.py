@@ -166,6 +166,12 @@ def is_of_rows(tensor: Any) -> bool:
     return _values(tensor) is not None
 
 
+def agreed(tensor: Tensor) -> bool:
+    """Return whether a number () is the same in all rows."""
+    values = _values(tensor)
+    return values is None or bool((values == values[:1]).all())
+
+
 def in_any_row(condition: Tensor) -> bool:
     """Return whether a condition holds in an entry of any row: a decision that rows share."""
     values = _values(condition)

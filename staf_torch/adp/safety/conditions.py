@@ -16,6 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from ...lanes.row_decisions import agreed, in_any_row
 from ...numerics.checks import fail, non_negative, one_or_each, positive, trailing
 from ...numerics.default_device import device_of
 from ...numerics.linalg import shortest_solution
@@ -35,6 +36,7 @@ _RESERVE = 1e-3  # share of a distance, and of the brakes, that a stop leaves
 _PERIODS = 5.0  # in which h falls by 1/e at the fastest decay that is chosen without being asked for
 _CAREFUL, _RARE = 0.5, 0.1  # a stop is looked into from this share of that quantile of the brakes on
 _FAR = 100.0  # times the largest bound, to which brakes may use an input that has none
+_ON_EDGE = 1e-12  # of h and h', at which a state is on an edge
 _SEVERAL = 1 / 3  # of the edges tried, on which brakes that cannot hold h make a constraint a weak one
 
 
@@ -109,12 +111,10 @@ class Conditions(nn.Module):
             x, t = x[:_PROBES], t[:_PROBES]
         self.degree = self._degrees(degree, x, t)
         found = _brakes(self, x, t)
-        self.braked, self.limited, self.weak, self.apart = (
-            found.braked,
-            found.limited,
-            found.weak,
-            found.apart,
-        )
+        self.braked, self.limited, self.weak = found.braked, found.limited, found.weak
+        self.apart = found.apart
+        self.register_buffer("frail", found.frail)
+        self.frail: Tensor | None  # (k,) 1 where a row's own brakes are weak; None where rows are alike
         self.register_buffer("brakes", found.constant)
         self.register_buffer("usual", found.usual)
         self.brakes: Tensor  # (k,)
@@ -271,10 +271,8 @@ class Conditions(nn.Module):
     def _around(self) -> tuple[Tensor, Tensor]:
         """Return states around the equilibrium, and times."""
         generator = torch.Generator().manual_seed(0)
-        around = torch.randn(
-            _PROBES, self.plant.dim or 0, dtype=torch.float64, generator=generator, device="cpu"
-        )
-        rest = self.plant.equilibrium()
+        rest, size = self.plant.equilibrium(), (_PROBES, self.plant.dim or 0)
+        around = torch.randn(size, dtype=torch.float64, generator=generator, device="cpu")
         x = (rest + around.to(rest.device)).repeat(len(TIMES), 1)
         return x, torch.tensor(TIMES, dtype=torch.float64, device=x.device).repeat_interleave(_PROBES)
 
@@ -318,7 +316,8 @@ class _Brakes(NamedTuple):
     constant: Tensor  # (k,) it; inf where it is not
     limited: tuple[bool, ...]  # whether bounds limit what the inputs can do
     usual: Tensor  # (k,) what they can add a unit of the gradient; inf where nothing limits it
-    weak: tuple[bool, ...]  # whether there are edges, h = h' = 0, at which they cannot hold it
+    weak: tuple[bool, ...]  # whether there are edges, h = h' = 0, at which they cannot hold it, in any row
+    frail: Tensor | None  # (k,) 1 where that is so in a row; None where all rows are alike
     apart: bool  # whether all are constant, and braking for one never drives another
     decay: Tensor  # (k,) by default
 
@@ -354,23 +353,25 @@ def _brakes(of: Conditions, x: Tensor, t: Tensor) -> _Brakes:
         same = within and of.degree[k] == 2 and _same(ability) and _same(lean.slope[:, k])
         good = same and bool(ability[0] > _NOTHING)
         constant.append(ability[0] if good else none)
-        middle = torch.where(inside, reach, torch.nan).nanmedian()
-        weak.append(within and not good and _is_weak(of, k, x, t, middle))
+        unsure, middle = within and not good, torch.where(inside, reach, torch.nan).nanmedian()
+        weak.append(_weakness(of, k, x, t, middle) if unsure else torch.zeros_like(none))
         slowest = _decay(value, reach, inside) if within and of.degree[k] == 2 else fastest
         decays.append(torch.minimum(slowest, fastest))
         braked.append(good)
         limited.append(within)
+    any_weak = tuple(in_any_row(each > 0) for each in weak)
     alone = all(braked[k] or of.degree[k] == 1 or not limited[k] for k in range(count))
     apart = (
         alone
-        and not any(weak)
+        and not any(any_weak)
         and all(
             _apart(lean, i, j) for i in range(count) for j in range(i) if of.degree[i] == of.degree[j] == 2
         )
     )
-    numbers = map(torch.stack, (constant, usual, decays))
-    most, often, rates = (each.detach() for each in numbers)
-    return _Brakes(tuple(braked), most, tuple(limited), often, tuple(weak), apart, rates)
+    numbers = map(torch.stack, (constant, usual, decays, weak))
+    most, often, rates, own = (each.detach() for each in numbers)
+    frail = None if all(map(agreed, weak)) else own
+    return _Brakes(tuple(braked), most, tuple(limited), often, any_weak, frail, apart, rates)
 
 
 def _decay(value: Tensor, reach: Tensor, inside: Tensor) -> Tensor:
@@ -391,8 +392,8 @@ def _apart(lean: Lean, i: int, j: int) -> bool:
     return not opposed or _same(lean.value[:, i] + lean.value[:, j])
 
 
-def _is_weak(of: Conditions, k: int, x: Tensor, t: Tensor, usual: Tensor) -> bool:
-    """Return whether the bounds cannot hold h at several states of its edge, where h (and h') are 0."""
+def _weakness(of: Conditions, k: int, x: Tensor, t: Tensor, usual: Tensor) -> Tensor:
+    """Return 1 if the bounds cannot hold h at several states of its edge, where h (and h') are 0; else 0."""
 
     def off(x: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
         found = torch.stack(of.level(k, x.unsqueeze(0), t)[: of.degree[k]])
@@ -402,12 +403,14 @@ def _is_weak(of: Conditions, k: int, x: Tensor, t: Tensor, usual: Tensor) -> boo
     for _ in range(6):  # Newton's steps of least length
         slope, value = torch.func.vmap(torch.func.jacrev(off, has_aux=True))(edge, t)
         edge = edge - shortest_solution(torch.nan_to_num(slope), value)
+        if not in_any_row(value.abs() > _ON_EDGE):
+            break
     near = (torch.func.vmap(off)(edge, t)[0].abs() < 1e-6).all(-1) & torch.isfinite(edge).all(-1)
-    if not bool(near.any()):
-        return False
     (*_, ability) = torch.func.vmap(functools.partial(of.lean, k))(edge.unsqueeze(1), t)
     short = near & (ability < 1e-3 * usual * (of.degree[k] == 2))
-    return bool(short.double().sum() / near.double().sum() > _SEVERAL)
+    weak = short.double().sum() > _SEVERAL * near.double().sum()
+    # Where the degree is one, whether rows brake apart depends on it: they agree, or part.
+    return weak.to(x) if of.degree[k] == 2 else x.new_tensor(float(bool(weak)))
 
 
 def _speed(rate: Tensor) -> Tensor:

@@ -68,6 +68,11 @@ class LookAhead(nn.Module):
         self.against = found.rate
         self.opposed = bool((found.rate > 0).any())
         self.weak = any(conditions.weak)
+        frail = conditions.frail
+        if self.opposed and frail is not None:  # what is followed differs too: rows part
+            self.weak, frail = bool((frail > 0).any()), None
+        self.register_buffer("frail", None if frail is None else frail.amax())
+        self.frail: Tensor | None  # () 1 where a row's own brakes are weak; None where rows are alike
         self.acts = any(conditions.limited) or self.opposed
         self.by_policy = policy is not None and (self.weak or (self.opposed and found.alone is not None))
         self.by_brakes = not (self.opposed and self.by_policy)
@@ -78,6 +83,8 @@ class LookAhead(nn.Module):
             slow = (-(torch.zeros_like(count) if found.alone is None else found.alone)).clamp(min=1e-9)
             periods = (_CONSTANTS / slow / conditions.hold).ceil().clamp(max=_FOLLOWED)
             count = torch.maximum(count, periods)
+            if self.frail is not None:
+                count = count * self.frail  # what no weak brakes ask for is not followed
             self.counted = is_of_rows(count)
             while in_any_row(count > self.periods):
                 self.periods += 1
@@ -124,7 +131,7 @@ class LookAhead(nn.Module):
             if self.opposed:
                 first, second = wanted, found
             elif self.weak:
-                second = wanted
+                second = wanted if self.frail is None else torch.where(self.frail > 0, wanted, second)
             turn = count.unsqueeze(-1)
             tried = torch.where(turn == 2, 0.5 * (found + hardest), hardest)
             tried = torch.where(turn == 0, first, torch.where(turn == 1, second, tried))
@@ -172,7 +179,10 @@ class LookAhead(nn.Module):
         spent = None
         if self.by_policy and policy is not None:
             followed, spent = self._followed(policy, end, time)
-            later = torch.maximum(later, (followed - least).amin(-1))
+            back = (followed - least).amin(-1)
+            if self.frail is not None:
+                back = torch.where(self.frail > 0, back, later)
+            later = torch.maximum(later, back)
         left = torch.minimum((ends.least(of.hold) - least).amin(-1), later)
         if not self.opposed or spent is None:
             return left
@@ -190,6 +200,8 @@ class LookAhead(nn.Module):
         of = self.conditions
         second = torch.tensor(of.degree, dtype=torch.int64, device=x.device) == 2
         weak = torch.tensor(of.weak, dtype=torch.bool, device=x.device)
+        if of.frail is not None:
+            weak = of.frail > 0
         value, rate, _ = of.every(of.level, x, t)
         start = x, t, value, rate, value, value, strength, t == t
         rest, longest = of.plant.resting_input().to(x), self.longest.to(x)
@@ -289,7 +301,8 @@ def opposition(of: Conditions, policy: Policy | None) -> Opposed:
     normals = [torch.func.vmap(torch.func.grad(lambda x, h=h: h(x.unsqueeze(0), x.new_zeros(()))[0]))
                for h in of.constraints]  # fmt: skip
     for k, normal in enumerate(normals):
-        grown = torch.stack([_growth(c, a, b, closed, of.decay[k], of.degree[k]) for c in normal(x[:8])])
+        along = [(c, a, b, closed, of.decay[k], of.degree[k], modes.real.max()) for c in normal(x[:8])]
+        grown = torch.stack([_growth(*each) for each in along])
         known = grown == grown
         middle = grown.sort().values.gather(0, known.sum().unsqueeze(0) // 2 % len(grown))[0]
         rates.append(torch.where(known.any() & (middle > 0) & ~lost, middle, 0.0))
@@ -305,8 +318,11 @@ def opposition(of: Conditions, policy: Policy | None) -> Opposed:
     return Opposed(rate, alone, bowl)
 
 
-def _growth(c: Tensor, a: Tensor, b: Tensor, closed: Tensor, decay: Tensor, degree: int) -> Tensor:
-    """Return the growth of the fastest mode along an edge of normal c, 0 for none; NaN without an effect."""
+def _growth(
+    c: Tensor, a: Tensor, b: Tensor, closed: Tensor, decay: Tensor, degree: int, before: Tensor
+) -> Tensor:
+    """Return the growth of the fastest mode along an edge of normal c, faster than ``before``, 0 for none;
+    NaN without an effect."""
     phi, push = (c, c @ b) if degree == 1 else (c @ a + decay * c, c @ a @ b)
     size = push.square().sum()
     effect = size > 1e-12 * (c.square().sum() * b.square().sum()).clamp(min=1e-300)
@@ -314,7 +330,7 @@ def _growth(c: Tensor, a: Tensor, b: Tensor, closed: Tensor, decay: Tensor, degr
     along = closed - torch.outer(b @ push, phi @ (closed + decay * eye)) / torch.where(effect, size, 1.0)
     known = effect & torch.isfinite(along).all()
     modes = torch.linalg.eigvals(torch.where(known, along, 0.0))
-    growth, before = modes.real.max(), torch.linalg.eigvals(closed).real.max()
+    growth = modes.real.max()
     grows = growth > torch.maximum(_UNSTABLE * modes.abs().max(), before)
     return torch.where(known, torch.where(grows, growth, 0.0), torch.nan)
 

@@ -374,7 +374,7 @@ class SafetyFilter(Controller):
                 look = look | (asked > 0)
                 astray = look.to(x)
             elif self.ahead.weak:
-                look = t == t
+                look = t == t if self.ahead.frail is None else look | (self.ahead.frail > 0)
             chosen = self.ahead.choose(self._policy, (at, u, x, t), look)
             u = torch.where(look.unsqueeze(-1), chosen.control, u)
             # A barrier of degree two that the bounds cannot meet is no loss where the brakes do.
