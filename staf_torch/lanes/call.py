@@ -92,12 +92,39 @@ Where = bool | torch.device
 processor: Where = True  # of tensors on the CPU; `device.host` has it be a device
 
 
+def readable(x: Any, recorded: bool) -> bool:
+    """Return whether compiled code may read a tensor where it lies, wherever that is.
+
+    The one rule of all that is given to compiled code, samples of streams, too: a tensor of no subclass,
+    without a pending sign, of which nobody wants a derivative. Device, dtype and layout are the caller's.
+
+    Args:
+        x: the tensor, or anything.
+        recorded: whether one that requires a gradient is refused.
+    """
+    return type(x) in _TENSORS and not (recorded and x.requires_grad) and not x.is_neg()
+
+
+def seen(leaves: Sequence[Any]) -> tuple[tuple[Form, ...], Where]:
+    """Return the forms of inputs, and where they are as `ordinary` has it."""
+    recorded = torch.is_grad_enabled()
+    if seen_by_others():
+        return tuple(map(form, leaves)), False
+    forms: list[Form] = []
+    for leaf in leaves:
+        shared = type(leaf) is Shared
+        x = leaf.tensor if shared else leaf
+        if not (readable(x, recorded) and x.is_cpu):
+            return tuple(map(form, leaves)), ordinary(leaves)
+        forms.append((x.shape, x.stride(), x.dtype, shared))
+    return tuple(forms), processor
+
+
 def ordinary(leaves: Sequence[Any], *, recorded: bool | None = None) -> Where:
     """Return where plain tensors are of which nobody wants a derivative, False of others.
 
-    All that is given to compiled code passes here: dense, of no subclass, without a pending sign, on the CPU
-    or one CUDA device. Under a tracer, a transform of torch.func or another mode the operations themselves
-    are wanted.
+    All that is given to compiled code passes here: dense, `readable`, on the CPU or one CUDA device. Under a
+    tracer, a transform of torch.func or another mode the operations themselves are wanted.
 
     Args:
         leaves: the tensors, `Shared` ones among them.
@@ -108,7 +135,7 @@ def ordinary(leaves: Sequence[Any], *, recorded: bool | None = None) -> Where:
     recorded = torch.is_grad_enabled() if recorded is None else recorded
     for leaf in leaves:
         tensor = leaf.tensor if type(leaf) is Shared else leaf
-        if type(tensor) not in _TENSORS or (recorded and tensor.requires_grad) or tensor.is_neg():
+        if not readable(tensor, recorded):
             return False
         if not tensor.is_cpu:
             return _one_device(leaves, recorded)
@@ -125,7 +152,7 @@ def _one_device(leaves: Sequence[Any], recorded: bool) -> Where:
     found = set[torch.device]()
     for leaf in leaves:
         tensor = plain(leaf)
-        if type(tensor) not in _TENSORS or (recorded and tensor.requires_grad) or tensor.is_neg():
+        if not readable(tensor, recorded):
             return False
         if tensor.dim() or not tensor.is_cpu:
             found.add(tensor.device)
@@ -135,17 +162,17 @@ def _one_device(leaves: Sequence[Any], recorded: bool) -> Where:
 
 def seen_by_others() -> bool:
     """Return whether a tracer, a transform of torch.func or forward mode looks at the operations."""
-    return transformed() or torch._C._len_torch_dispatch_stack() > 0
+    return _transforms() is not None or forward_ad._current_level >= 0 or _modes() > 0
 
 
 def transformed() -> bool:
     """Return whether a transform of torch.func or forward mode looks at the operations."""
-    return torch._C._functorch.peek_interpreter_stack() is not None or forward_ad._current_level >= 0
+    return _transforms() is not None or forward_ad._current_level >= 0
 
 
 def say_transformed(name: str) -> None:
     """Log once that a transform keeps a program in plain torch, where one looks and nobody traces."""
-    if transformed() and not torch._C._len_torch_dispatch_stack():
+    if transformed() and not _modes():
         say(
             name,
             "a transform of `torch.func` (vmap, jacrev, grad, ...) or forward mode is active",
@@ -153,20 +180,12 @@ def say_transformed(name: str) -> None:
 
 
 _TENSORS = (Tensor, torch.nn.Parameter)
+_transforms, _modes = torch._C._functorch.peek_interpreter_stack, torch._C._len_torch_dispatch_stack
 
 
 def at_once(x: Tensor) -> bool:
     """Return `ordinary` of one tensor where the processor's lanes run it, and not on `device.host`."""
-    return (
-        type(x) is Tensor
-        and x.is_cpu
-        and not (x.requires_grad and torch.is_grad_enabled())
-        and not x.is_neg()
-        and torch._C._functorch.peek_interpreter_stack() is None
-        and forward_ad._current_level < 0
-        and not torch._C._len_torch_dispatch_stack()
-        and processor is True
-    )
+    return readable(x, torch.is_grad_enabled()) and x.is_cpu and processor is True and not seen_by_others()
 
 
 def form(leaf: Any) -> Form:
@@ -215,7 +234,6 @@ class PlannedCall:
         if compiled.rows:
             leaves, times = self._with_columns(leaves), [*[False] * len(compiled.rows), *times]
         self._copied: list[int] = []  # inputs of another dtype, or without one stride from entry to entry
-        self._large: list[int] = []
         slots = [
             self._input(k, leaf, timed) for k, (leaf, timed) in enumerate(zip(leaves, times, strict=True))
         ]
@@ -246,10 +264,9 @@ class PlannedCall:
         self._dtypes = [
             (k, dtype) for k, (_, dtype) in enumerate((*compiled.carry, *compiled.outputs)) if dtype != real
         ]
-        self._like = torch.empty(0, dtype=real, device="cpu")  # whatever the default device is
-        for k, (shape, _) in enumerate(self._rooms):
-            if torch.Size(shape).numel() * self._like.element_size() >= LARGE:
-                self._large.append(k)
+        self._like = torch.empty(0, dtype=real, device="cpu")  # of large ones; whatever the default device is
+        self._likes = [] if rooms else [self._without_memory(*each) for each in self._rooms]
+        self._large = [k for k, like in enumerate(self._likes) if like is self._like]
         self.simple = self.direct and not (compiled.rows or self._large or self._dtypes or backwards or rooms)
         self.simple = self.simple and self._rows_and_times < _MANY
         self._packed = struct.Struct(f"{len(slots)}q").pack
@@ -274,6 +291,17 @@ class PlannedCall:
         record = _AgainRecord(run, self._reference, data, len(given), len(to), ctypes.addressof(places))
         record.kept = self, given, packed, places
         return record
+
+    def _without_memory(self, shape: Sequence[int], strides: Sequence[int]) -> Tensor:
+        """Return a tensor of which nothing but its form may be read: `torch.empty_like` makes others.
+
+        That takes two thirds of the time of `torch.empty_strided`, which reads shape and strides of Python.
+        """
+        if torch.Size(shape).numel() * self._like.element_size() >= LARGE:
+            return self._like
+        like = torch.empty_strided(shape, strides, dtype=self._like.dtype, device="cpu")
+        like.untyped_storage().resize_(0)
+        return like
 
     def _reverse(self, slots: list[_Slot], steps: int, recorded: int) -> list[int]:
         """Turn the times of all slots around; return the bytes from an address to that of the last time."""
@@ -302,16 +330,12 @@ class PlannedCall:
         Args:
             leaves: inputs of the forms that the examples had.
         """
-        given, real = leaves, self._compiled.real
         if self.simple:
-            rooms = [
-                torch.empty_strided(shape, strides, dtype=real, device=_CPU) for shape, strides in self._rooms
-            ]
-            addresses = self._packed(*map(_address, given), *map(_address, rooms))
-            self._compiled.call(self._reference, addresses, torch.get_num_threads())
+            rooms = [*map(_empty_like, self._likes)]
+            addresses = self._packed(*map(_address, leaves), *map(_address, rooms))
+            self._compiled.call(self._reference, addresses, _threads())
             return rooms
-        empty = torch.empty_strided
-        rooms = [empty(shape, strides, dtype=real, device=_CPU) for shape, strides in self._rooms]
+        rooms = [*map(_empty_like, self._likes)]
         for k in self._large:
             shape, strides = self._rooms[k]
             rooms[k] = fresh(self._like, torch.Size(shape).numel()).as_strided(shape, strides)
@@ -365,13 +389,13 @@ class PlannedCall:
         """
         if not self.simple or len(self._rooms) != 1:
             return None
-        (size, _), real = self._compiled.outputs[0], self._compiled.real
+        size, _ = self._compiled.outputs[0]
         strides = inner_strides(size, self._rows)
-        shape, strides = (*lead, *size), (*(1 for _ in lead), *strides)
+        like = self._without_memory((*lead, *size), (*(1 for _ in lead), *strides))
         packed, call, reference, threads = self._packed, self._compiled.call, self._reference, _threads
 
         def found(*given: Tensor) -> Tensor:
-            room = torch.empty_strided(shape, strides, dtype=real, device=_CPU)
+            room = _empty_like(like)
             call(reference, packed(*map(_address, given), room.data_ptr()), threads())
             return room
 
@@ -379,7 +403,7 @@ class PlannedCall:
         return found
 
 
-_address, _threads, _CPU = Tensor.data_ptr, torch.get_num_threads, torch.device("cpu")
+_address, _threads, _empty_like = Tensor.data_ptr, torch.get_num_threads, torch.empty_like
 
 
 def inner_strides(shape: Sequence[int], unit: int) -> tuple[int, ...]:

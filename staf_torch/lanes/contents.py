@@ -20,8 +20,8 @@ import math
 import operator
 import pickle
 import sys
-from collections.abc import Callable, Iterator
-from itertools import chain
+from collections.abc import Callable, Iterable, Iterator
+from itertools import chain, repeat
 from operator import is_
 from types import BuiltinFunctionType, CellType, CodeType, FunctionType, MethodType, ModuleType
 from typing import Any, cast
@@ -50,6 +50,7 @@ _log = logging.getLogger(__name__)
 _said: set[tuple[str, str]] = set()  # what has been logged
 _TOLD = "a number of the table"
 _REQUIRES, _VERSION = operator.attrgetter("requires_grad"), operator.attrgetter("_version")
+_CODE_OF, _CONTENT = operator.attrgetter("__code__", "__defaults__"), operator.attrgetter("cell_contents")
 _BASE, _ARRAY = operator.itemgetter(*_READ), operator.methodcaller("tobytes")
 BOUND = "_compiled_methods"
 """Attribute in which an object holds its compiled methods: no part of what it is."""
@@ -124,7 +125,9 @@ class Contents:
         owners = [(attributes, own) for attributes, own in walk.modules if own]
         self._owners = [attributes for attributes, _ in owners]
         self._own = [operator.itemgetter("training", *own) for _, own in owners]
-        self._functions = walk.functions or walk.lookups or walk.cells
+        lookups = walk.lookups
+        self._looked_up = [lookup.space for lookup in lookups], [lookup.name for lookup in lookups]
+        self._content = content_of if any(content_of(cell) is EMPTY for cell in walk.cells) else _CONTENT
         self._lengths, self._inside = [*map(len, self._sized)], [*self._look()]
         self._bases = [*map(_BASE, self._modules)]
         self._methods = self.methods()
@@ -147,15 +150,16 @@ class Contents:
         """
         try:
             return (
-                [*map(len, self._sized)] == self._lengths
+                (not self._sized or [*map(len, self._sized)] == self._lengths)
                 and not any(self._walk.empty)
-                and [*map(_BASE, self._modules)] == self._bases  # the same objects: nothing else is compared
+                # the same objects: nothing else is compared
+                and (not self._modules or [*map(_BASE, self._modules)] == self._bases)
                 and all(map(is_, self._look(), self._inside))
-                and [*map(_VERSION, self._changeable)] == self._versions
+                and (not self._changeable or [*map(_VERSION, self._changeable)] == self._versions)
                 and not (self._rare and any(now(part) != then for now, part, then in self._rare))
                 and not (library and self.replaced(self._methods))
             )
-        except (KeyError, RuntimeError):  # an attribute is gone, or comes from another thread meanwhile
+        except (KeyError, RuntimeError, ValueError):  # what is gone, or comes from another thread meanwhile
             return False
 
     def renewed(self) -> bool:
@@ -199,14 +203,15 @@ class Contents:
 
     def _look(self) -> Iterator[Any]:
         """Look into all containers, and at what functions read beside."""
-        own = chain.from_iterable(map(operator.call, self._own, self._owners))
-        if not self._functions:
-            return chain(chain.from_iterable(self._views), own)
         walk = self._walk
-        codes = ((part.__code__, part.__defaults__) for part in walk.functions)  # an editor may reload them
-        read = (lookup.value for lookup in walk.lookups)
-        cells = map(content_of, walk.cells)
-        return chain(chain.from_iterable(self._views), own, read, cells, chain.from_iterable(codes))
+        found: list[Iterable[Any]] = [*self._views, *map(operator.call, self._own, self._owners)]
+        if walk.functions:
+            found += map(_CODE_OF, walk.functions)  # an editor may reload them
+        if walk.lookups:
+            found.append(map(dict.get, *self._looked_up, repeat(EMPTY)))
+        if walk.cells:
+            found.append(map(self._content, walk.cells))
+        return chain.from_iterable(found)
 
 
 @functools.lru_cache(maxsize=4096)

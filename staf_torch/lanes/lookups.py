@@ -18,9 +18,8 @@ OF_PYTHON = frozenset(sys.stdlib_module_names) - {"__main__"}
 _FOLDERS = tuple(Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib", "purelib", "platlib"))
 _PACKAGES = frozenset(("site-packages", "dist-packages"))
 _SIMPLE = (int, float, complex, str, bytes, tuple, list, dict, set, frozenset, Tensor)
-_MISSING = object()
 EMPTY = object()
-"""In a cell whose name has no value yet."""
+"""In a cell whose name has no value yet, and in place of a global that is gone."""
 
 
 class Lookup(NamedTuple):
@@ -31,7 +30,7 @@ class Lookup(NamedTuple):
 
     @property
     def value(self) -> Any:
-        return self.space.get(self.name, _MISSING)
+        return self.space.get(self.name, EMPTY)
 
 
 def lookups(function: FunctionType) -> Iterator[Lookup]:

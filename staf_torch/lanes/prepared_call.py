@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from .adjoint import GradientCall
-from .call import PlannedCall, Where, form, ordinary, say_transformed, seen_by_others
+from .call import PlannedCall, Where, form, ordinary, say_transformed, seen, seen_by_others
 from .call_inputs import Given, whole
 from .device.kernel import DeviceCall
 from .log import say
@@ -49,13 +49,15 @@ class Prepared:
     def __call__(self, carry: Tree, now: Tree = (), row: Tree = ()) -> tuple[Tree, Tree]:
         """The carry after the last step, and the outputs."""
         leaves, structure = flatten((row, now, carry))
-        if structure != self._structure or tuple(map(form, leaves)) != self._forms:
+        forms, where = seen(leaves)
+        if structure != self._structure or forms != self._forms:
             return self._program(carry, now, row, steps=self._steps, every=self._every)
-        return self.run(leaves, carry, now, row)
+        return self.run(leaves, where, carry, now, row)
 
-    def run(self, leaves: Sequence[Any], carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
-        """Run with inputs that are known to fit."""
-        where = ordinary(leaves)
+    def run(
+        self, leaves: Sequence[Any], where: Where, carry: Tree, now: Tree, row: Tree
+    ) -> tuple[Tree, Tree]:
+        """Run with inputs that are known to fit, and to be somewhere."""
         if self._refused or not where or self._program.differentiated():
             return self._otherwise(leaves, carry, now, row)
         if where != self._where:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..signs import Sign
 from .adjoint_steps import keeping_step
-from .call import Compiled, form, ordinary, served
+from .call import Compiled, seen, served
 from .call_inputs import Given, one_precision, whole
 from .compiler import machine_code
 from .contents import Contents, Derived
@@ -144,15 +144,15 @@ class Program(Derived):
             The carry, (B, ...), and the outputs, (B, ceil(T / every), ...).
         """
         if tracing_now() and every == 1 and _loops_over(now):  # within a program that is traced
-            return scan(lambda carry, now: self.step(carry, now, row), carry, now)
+            return scan(lambda carry, now, of=self.step, row=row: of(carry, now, row), carry, now)
         if not self.compile:  # nothing to prepare or to watch
             return self.definition(carry, now, row, steps=steps, every=whole("every", every, 1))
         self._look_around()
         leaves, structure = flatten((row, now, carry))
         known = self._prepared  # of this step: another dictionary takes its place where that changes
         try:
-            key = structure, tuple(map(form, leaves)), steps, every
-            prepared = known.get(key)
+            forms, where = seen(leaves)
+            prepared = known.get(key := (structure, forms, steps, every))
         except (RuntimeError, TypeError):  # something that is no tensor here, or not dense: this names it
             Given.of(carry, now, row, steps)
             raise
@@ -160,7 +160,7 @@ class Program(Derived):
             if len(known) >= _PREPARED:
                 known.clear()
             prepared = known[key] = self.prepare(carry, now, row, steps=steps, every=every)
-        return prepared.run(leaves, carry, now, row)
+        return prepared.run(leaves, where, carry, now, row)
 
     def over(self, points: tuple[Tensor, ...], fixed: tuple[Tensor, ...] = ()) -> Tree:
         """The outputs of one step without a carry at many points of every row: (B, P, ...).
@@ -221,14 +221,14 @@ class Program(Derived):
         """Return whether the compiled program serves these inputs."""
         self._look_around()
         leaves, structure = flatten((row, now, carry))
-        prepared = self._prepared.get((structure, tuple(map(form, leaves)), steps, 1))
-        plan = None if prepared is None else prepared.plan
-        if plan is not None and ordinary(leaves) and not self.differentiated():  # it has served such ones
-            return True
+        forms, where = seen(leaves)
+        prepared = self._prepared.get((structure, forms, steps, 1))
+        if prepared is not None and prepared.plan is not None and where and not self.differentiated():
+            return True  # it has served such ones
         if not served(leaves):
             return False
         self.reads()
-        wanted, given = self.differentiated() or not ordinary(leaves), Given.of(carry, now, row, steps)
+        wanted, given = self.differentiated() or not where, Given.of(carry, now, row, steps)
         with torch.no_grad():
             return (self.keeping(given) if wanted else self.find(given)) is not None
 

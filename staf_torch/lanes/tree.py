@@ -41,7 +41,16 @@ def _structure(tree: Any, leaves: list[Any]) -> Hashable:
         leaves.append(tree)
         return _LEAF
     if kind is tuple:
-        return (kind, tuple([_structure(part, leaves) for part in tree])) if tree else _EMPTY
+        if not tree:
+            return _EMPTY
+        parts: list[Hashable] = []
+        for part in tree:
+            if type(part) is Tensor:
+                leaves.append(part)
+                parts.append(_LEAF)
+            else:
+                parts.append(_structure(part, leaves))
+        return kind, tuple(parts)
     if isinstance(tree, dict):
         return tuple(tree), tuple(_structure(part, leaves) for part in tree.values())
     if isinstance(tree, list | tuple):
