@@ -29,7 +29,7 @@ class ExponentialKernel(Kernel):
     scale_slope = 1.0
 
     def forward(self, x1: Tensor, x2: Tensor) -> Tensor:
-        return inner(x1, x2).exp()
+        return inner(x1, x2).exp_()
 
     def gradient(self, x1: Tensor, x2: Tensor, b: Tensor) -> Tensor:
         return (inner(x1, x2).exp() * b.unsqueeze(-2)) @ x2

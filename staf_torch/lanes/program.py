@@ -144,7 +144,7 @@ class Program(Derived):
             The carry, (B, ...), and the outputs, (B, ceil(T / every), ...).
         """
         if tracing_now() and every == 1 and _loops_over(now):  # within a program that is traced
-            return scan(lambda carry, now, of=self.step, row=row: of(carry, now, row), carry, now)
+            return scan(lambda carry, now: self.step(carry, now, row), carry, now)
         if not self.compile:  # nothing to prepare or to watch
             return self.definition(carry, now, row, steps=steps, every=whole("every", every, 1))
         self._look_around()
