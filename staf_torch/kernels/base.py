@@ -47,7 +47,7 @@ class Kernel(nn.Module, metaclass=OfRows):
     """q where s(x, z) = q x'z plus a function of z alone, None where s has another form."""
 
     def __call__(self, x1: Tensor, x2: Tensor) -> Any:
-        if type(x1) is Tensor is type(x2) and x1.is_floating_point() and x2.is_floating_point():  # most of all
+        if type(x1) is Tensor is type(x2) and x1.is_floating_point() and x2.is_floating_point():
             return super().__call__(x1, x2)
         return super().__call__(states(self, "x1", x1), states(self, "x2", x2))
 
