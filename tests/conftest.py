@@ -43,6 +43,10 @@ AS_FOR_USERS = (
 beside others or rounding are the matter. A filter of streams then takes 8 s to build, and 1 s otherwise."""
 
 logging.getLogger("staf_torch.lanes.short_calls").setLevel("ERROR")  # the suite is many short calls
+for logger in logging.root.manager.loggerDict.values():
+    if isinstance(logger, logging.Logger) and logger.name.startswith("torch"):
+        # Else pytest adds its handlers to each of fifty loggers and takes them off again, six times a test.
+        logger.propagate = True
 
 hypothesis.settings.register_profile("suite", max_examples=25, deadline=None, derandomize=True)
 hypothesis.settings.load_profile("suite")
@@ -127,7 +131,8 @@ def _alike_in_every_order(
     # `torch.manual_seed` also writes down, for every kind of device and with the stack, what is to be done
     # when it begins to be used: a third of what pytest itself takes of a test, and a list that grows.
     torch.default_generator.manual_seed(0)
-    logging.root.setLevel(logging.WARNING)  # a command that a test ran in this process has set it
+    if logging.root.level != logging.WARNING:  # a command that a test ran in this process has set it
+        logging.root.setLevel(logging.WARNING)
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)  # `main` sets it for Hydra
     room = request.path.relative_to(TESTS).parts[0]
     if room in OPTIMISED and any(words in request.node.name for words in AS_FOR_USERS):

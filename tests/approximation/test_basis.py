@@ -12,7 +12,7 @@ import torch
 from helpers import basis_of, centers_of, tensor, uniform
 from hypothesis import given, settings
 from hypothesis import strategies as some
-from variants import KERNELS, LAYOUTS, RADII, TARGETS, over
+from variants import KERNELS, RADII, TARGETS, by_turns, directions_of, over
 
 import staf_torch as st
 from staf_torch.approximation import conditioning
@@ -22,8 +22,7 @@ from staf_torch.targets import Cosine, Paper, Quadratic
 SEEDS = some.integers(0, 2**31)
 
 
-@over(KERNELS)
-@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
+@pytest.mark.parametrize(("name", "batch"), by_turns(KERNELS, [(), (2, 3)]))
 def test_basis_is_the_kernel_at_the_centers(name: str, batch: tuple[int, ...]) -> None:
     basis = basis_of(name)
     x, y = uniform(*batch, 2), uniform(*batch, 5, 2)
@@ -44,12 +43,19 @@ class Tilted(st.Kernel):
 OWN = {**{name: case.make for name, case in KERNELS.items()}, "tilted": Tilted}
 
 
-@pytest.mark.parametrize("layout", ["rings6", "polygon1", "ball_of_one"])
-@over({**RADII, "as_good_as_constant": (lambda: st.StateRadius(0.3, 0.5, gain=2.0),)}, "radius")
-@over(OWN)
+MADE = {
+    **{name: make for name, (make, _) in RADII.items()},
+    "as_good_as_constant": lambda: st.StateRadius(0.3, 0.5, 2.0),
+}
+PLACES = [(name, radius) for name in OWN for radius in MADE]
+
+
+@pytest.mark.parametrize(
+    ("name", "radius", "layout"),
+    [(*place, ("rings6", "polygon1", "ball_of_one")[k % 3]) for k, place in enumerate(PLACES)],
+)
 def test_a_basis_that_is_the_same_at_every_state_says_so_once(name: str, radius: str, layout: str) -> None:
-    made = {**RADII, "as_good_as_constant": (lambda: st.StateRadius(0.3, 0.5, gain=2.0),)}[radius][0]()
-    basis = st.StaFBasis(OWN[name](), st.StateFollowingCenters(LAYOUTS[layout].make(), made))
+    basis = st.StaFBasis(OWN[name](), st.StateFollowingCenters(directions_of(layout), MADE[radius]()))
     x = uniform(3, basis.dim, low=0.2, seed=1)
     alone = [basis.kernel(at[None], basis.centers(at)) for at in (*x, torch.zeros_like(x[0]))]
     constant = all(torch.allclose(one, alone[0], rtol=1e-9, atol=0) for one in alone)
@@ -90,8 +96,7 @@ def test_one_core_serves_all_states_where_kernel_and_radius_allow(name: str) -> 
     assert moving.gram_structure(x).core.shape == (5, 6, 6)
 
 
-@over(KERNELS)
-@over(TARGETS, "target")
+@pytest.mark.parametrize(("name", "target"), by_turns(KERNELS, list(TARGETS)))
 @pytest.mark.parametrize("radius", [0.8, st.StateRadius(1.5, 0.3)])
 def test_ideal_weights_interpolate_at_the_centers(name: str, target: str, radius: object) -> None:
     basis, function = basis_of(name, radius=radius), TARGETS[target][0]()
@@ -124,7 +129,7 @@ def test_batch_equals_loop(name: str) -> None:
 
 
 @over(KERNELS)
-@settings(max_examples=8)
+@settings(max_examples=3)
 @given(seed=SEEDS)
 def test_ideal_weights_minimise_the_native_error(name: str, seed: int) -> None:
     basis = basis_of(name, radius=0.7)

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.func import functional_call, grad, vmap
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torch.utils.checkpoint import checkpoint
-from variants import KERNELS, LEARNABLE_KERNELS, learned, over
+from variants import KERNELS, LEARNABLE_KERNELS, by_turns, learned, over
 
 from staf_torch import (
     GaussianKernel,
@@ -164,20 +164,20 @@ def test_everything_learns_from_the_first_step_behind_and_before_a_layer(name: s
     assert bool(alone.coefficients.grad.any())
 
 
-@pytest.mark.parametrize(
-    ("held_in", "points_in"),
-    [
-        (torch.float64, torch.float32),
-        (torch.float64, torch.float16),
-        (torch.float32, torch.float64),
-        (torch.bfloat16, torch.bfloat16),
-        (torch.float16, torch.float32),
-    ],
-)
-@over(KERNELS)
+DTYPES = [
+    (torch.float64, torch.float32),
+    (torch.float64, torch.float16),
+    (torch.float32, torch.float64),
+    (torch.bfloat16, torch.bfloat16),
+    (torch.float16, torch.float32),
+]
+
+
+@pytest.mark.parametrize(("name", "dtypes"), by_turns(KERNELS, DTYPES))
 def test_values_are_of_the_dtype_of_the_points(
-    name: str, held_in: torch.dtype, points_in: torch.dtype, points: Tensor
+    name: str, dtypes: tuple[torch.dtype, torch.dtype], points: Tensor
 ) -> None:
+    held_in, points_in = dtypes
     staf = around(name, 2)
     y = (0.5 * points).to(points_in)
     exact = staf(y.double()).detach()
