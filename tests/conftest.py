@@ -137,6 +137,8 @@ def _alike_in_every_order(
     room = request.path.relative_to(TESTS).parts[0]
     if room in OPTIMISED and any(words in request.node.name for words in AS_FOR_USERS):
         monkeypatch.setenv("CXXFLAGS", OWN)
+    elif "stream_with_bands" in request.node.name:  # a mixture learns thousands of samples
+        monkeypatch.setenv("CXXFLAGS", f"{OWN} {QUICK[:-1]}1")
     if room in ("adp", "deploy") and quick_cc is not None:
         monkeypatch.setenv("CC", str(quick_cc))
     compiled = room in COMPILED or request.node.get_closest_marker("compiled") is not None

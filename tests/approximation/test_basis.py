@@ -120,15 +120,6 @@ def test_ideal_weights_are_those_of_fifty_digits(name: str) -> None:
 
 
 @over(KERNELS)
-def test_batch_equals_loop(name: str) -> None:
-    basis = basis_of(name, radius=0.6)
-    x = uniform(2, 3, 2, low=0.3)
-    together = basis.ideal_weights(x, Paper()).reshape(6, 6)
-    alone = torch.stack([basis.ideal_weights(at, Paper()) for at in x.reshape(6, 2)])
-    torch.testing.assert_close(together, alone, rtol=1e-9, atol=1e-9)
-
-
-@over(KERNELS)
 @settings(max_examples=3)
 @given(seed=SEEDS)
 def test_ideal_weights_minimise_the_native_error(name: str, seed: int) -> None:

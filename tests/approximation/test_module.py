@@ -50,13 +50,6 @@ def test_estimate_is_the_weighted_sum_of_the_kernels(name: str, radius: str) -> 
 
 
 @over(KERNELS)
-def test_weights_are_the_ideal_ones(name: str) -> None:
-    staf = fitted(name, (3,))
-    expected = staf.basis.ideal_weights(staf.state, Paper())
-    torch.testing.assert_close(staf.weights, expected, rtol=1e-12, atol=0)
-
-
-@over(KERNELS)
 @pytest.mark.parametrize("batch", BATCHES)
 def test_partial_gradient_is_that_of_the_estimate_with_the_centers_frozen(
     name: str, batch: tuple[int, ...]

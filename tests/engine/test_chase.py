@@ -17,7 +17,6 @@ from variants import KERNELS, LAWS, PAPER_LAW, by_turns, over
 import staf_torch as st
 from staf_torch import chase, chase_weights, systems, targets
 from staf_torch.engine import ChaseResult, chase_pieces, chunk_length
-from staf_torch.engine.result import concatenate
 from staf_torch.numerics.linalg import condition_number
 from staf_torch.optim import SteepestDescent
 from staf_torch.targets import Cosine, Paper
@@ -125,17 +124,6 @@ def test_a_target_that_is_not_finite_somewhere_freezes_only_the_row_that_goes_th
     result = st.chase(states, basis_of("gaussian", 3, 0.1), hole, SteepestDescent())
     assert result.diverged.tolist() == [True, False]
     assert torch.isfinite(result.estimate[1]).all()
-
-
-@pytest.mark.parametrize("kernel", ["exponential", "user_defined"])
-@pytest.mark.parametrize("sizes", [[1] * 13, [5, 1, 7]])
-def test_the_length_of_pieces_does_not_change_the_result(sizes: list[int], kernel: str) -> None:
-    states, basis = orbit(*STARTS, steps=12), basis_of(kernel, count=3, radius=0.3)
-    states[2, 9:] = torch.inf
-    whole = fields(run(states, kernel))
-    pieces = chase_pieces(states.split(sizes, dim=1), basis, Paper(), SteepestDescent())
-    for key, value in fields(concatenate(pieces)).items():
-        torch.testing.assert_close(value, whole[key], rtol=1e-12, atol=1e-12, equal_nan=True)
 
 
 def test_a_long_history_is_chased_in_pieces_of_some_64_megabytes() -> None:
