@@ -41,13 +41,21 @@ static void prepare(const Frame &f, int b);
 static void ahead(const Frame &f);
 static void advance(const Frame &f, int b, int rows);
 
+INLINE void copy(const REAL *from, int count, REAL *to) {
+    int r = 0;
+    for (; r + W <= count; r += W) store(to + r, load(from + r));
+    for (; r < count; ++r) to[r] = from[r];
+}
 // One number a row; beyond the rows they come again.
 INLINE void gather(const Slot *slot, REAL *const *data, int slots, int64_t first, int rows, REAL *to) {
     const int whole = (rows + lanes - 1) / lanes * lanes;
     for (int s = 0; s < slots; ++s, ++slot)
         for (int64_t e = 0; e < slot->entries; ++e, to += room) {
             const REAL *from = data[s] + first * slot->row + e * slot->entry;
-            for (int r = 0; r < rows; ++r) to[r] = from[r * slot->row];
+            if (slot->row == 1)
+                copy(from, rows, to);
+            else
+                for (int r = 0; r < rows; ++r) to[r] = from[r * slot->row];
             for (int r = rows; r < whole; ++r) to[r] = to[r - rows];
         }
 }
@@ -71,22 +79,24 @@ template <int S> INLINE void transpose(V *v) {
 #define TRANSPOSES 0
 #endif
 
-// Of every row one number after the other, of f.times times and `entries` entries: vectors of rows. By itself a
-// compiler takes a tenth less time for the program than inlined.
-__attribute__((noinline)) static int transposed(const REAL *from, int64_t row, int entries, const Frame &f, REAL *to) {
+// Of every row one number after the other, of f.times times and `entries` entries: vectors of rows. `from` is the
+// first of them in memory, and of the last time where times go back. By itself a compiler takes a tenth less time for
+// the program than inlined.
+__attribute__((noinline)) static int transposed(const REAL *from, int64_t row, int entries, bool back, const Frame &f, REAL *to) {
 #if TRANSPOSES
     const int rows = f.rows, span = f.span, numbers = f.times * entries, whole = numbers / W * W;
+    const int next = back ? -numbers : numbers, later = back ? -rows : rows, begin = back ? (f.times - 1) * rows : 0;
     for (int r = 0; r + W <= rows; r += W)
-        for (int first = 0, t = 0, e = 0; first < whole; first += W) {
+        for (int first = 0, t = begin, e = 0; first < whole; first += W) {
             V v[W];
             UNROLLED for (int k = 0; k < W; ++k) {
                 v[k] = load(from + (r + k) * row + first);
-                __builtin_prefetch(from + (r + k) * row + first + numbers);  // of the next piece of time
+                __builtin_prefetch(from + (r + k) * row + first + next);  // of the next piece of time
             }
             transpose<W / 2>(v);
             UNROLLED for (int k = 0; k < W; ++k) {
-                store(to + int64_t(e) * span + t * rows + r, v[k]);
-                if (++e == entries) e = 0, ++t;
+                store(to + int64_t(e) * span + t + r, v[k]);
+                if (++e == entries) e = 0, t += later;
             }
         }
     return whole;
@@ -99,8 +109,10 @@ INLINE void gather_times(const Slot *slot, REAL *const *data, int slots, const F
         if (!READ[s]) continue;
         const REAL *const from = data[s] + f.first * slot->row + f.time * slot->time;
         const int entries = int(slot->entries);
-        const bool dense = slot->time == entries && (slot->entry == 1 || entries == 1) && slot->row > 1;
-        const int done = dense && f.rows >= W ? transposed(from, slot->row, entries, f, to) : 0;
+        const bool back = slot->time == -entries;
+        const bool dense = (slot->time == entries || back) && (slot->entry == 1 || entries == 1) && slot->row > 1;
+        const REAL *const least = back ? from + (f.times - 1) * slot->time : from;
+        const int done = dense && f.rows >= W ? transposed(least, slot->row, entries, back, f, to) : 0;
         const bool far = slot->time * slot->time > int64_t(entries) * entries * f.rows * f.rows;
         const int there = done ? f.rows / W * W : 0;  // rows of which `done` numbers are there
         for (int e = 0; e < entries; ++e) {
@@ -111,12 +123,12 @@ INLINE void gather_times(const Slot *slot, REAL *const *data, int slots, const F
                 if (far)  // from time to time
                     for (int t = 0; t < f.times; ++t)
                         for (int r = 0; r < f.rows; r += W) __builtin_prefetch(at + (t + f.times) * slot->time + r);
-                for (int t = 0; t < f.times; ++t)
-                    for (int r = 0; r < f.rows; ++r) column[t * f.rows + r] = at[t * slot->time + r];
+                for (int t = 0; t < f.times; ++t) copy(at + t * slot->time, f.rows, column + t * f.rows);
             } else
                 for (int r = 0; r < f.rows; ++r) {
-                    const int first = r < there ? (done - e + entries - 1) / entries : 0;
-                    for (int t = first; t < f.times; ++t) column[t * f.rows + r] = at[r * slot->row + t * slot->time];
+                    const int met = r < there ? (done - e + entries - 1) / entries : 0;
+                    const int first = back ? 0 : met, last = back ? f.times - met : f.times;
+                    for (int t = first; t < last; ++t) column[t * f.rows + r] = at[r * slot->row + t * slot->time];
                 }
         }
     }
@@ -124,6 +136,24 @@ INLINE void gather_times(const Slot *slot, REAL *const *data, int slots, const F
 extern "C" void *aligned_alloc(__SIZE_TYPE__, __SIZE_TYPE__);  // of the C library: clang has no builtin of it
 INLINE REAL *allocate(int64_t numbers) {
     return static_cast<REAL *>(aligned_alloc(64, (numbers * sizeof(REAL) + 127) / 64 * 64));
+}
+
+// Sums of COUNT products of a table's numbers and vectors, some of them in registers at once.
+template <int SOME, int COUNT, int ROW, int STEP, int NEXT> INLINE void panel(const REAL *c, const V *x, V *to) {
+    V sum[SOME];
+    UNROLLED for (int r = 0; r < SOME; ++r) sum[r] = splat(c[r * ROW]) * x[0];
+    for (int q = 1; q < COUNT; ++q) {
+        const V one = x[q * NEXT];
+        UNROLLED for (int r = 0; r < SOME; ++r) sum[r] = fma(splat(c[r * ROW + q * STEP]), one, sum[r]);
+    }
+    UNROLLED for (int r = 0; r < SOME; ++r) to[r] = sum[r];
+}
+template <int OUTS, int COUNT, int ROW, int STEP, int NEXT>
+__attribute__((noinline)) static void products(const REAL *c, const V *x, V *to) {
+    constexpr int panels = (OUTS + 7) / 8, some = (OUTS + panels - 1) / panels;
+    for (int p = 0; p + some <= OUTS; p += some) panel<some, COUNT, ROW, STEP, NEXT>(c + p * ROW, x, to + p);
+    constexpr int rest = OUTS % some;
+    if constexpr (rest > 0) panel<rest, COUNT, ROW, STEP, NEXT>(c + (OUTS - rest) * ROW, x, to + OUTS - rest);
 }
 
 // A thread's memory stays with it from call to call: fresh pages cost more than a short program.
@@ -190,7 +220,8 @@ struct Work {
     void run() {
         int most = now_bytes / int(sizeof(REAL)) / (tile * (NOWS + AHEAD > 0 ? NOWS + AHEAD : 1));
         most = most < 1 ? 1 : most < most_times ? most : most_times;
-        most = AHEAD > 0 && most < least_times ? least_times : most;
+        // A piece also reads and writes the whole carry.
+        most = (AHEAD > 0 || CARRIES > NOWS) && most < least_times ? least_times : most;
         most = most < call.times ? most : int(call.times);
         const int span = most * int(tile) + lanes;
         const int64_t numbers = int64_t(ROWS + FIXED + CARRIES) * room + int64_t(NOWS + AHEAD) * span;
@@ -226,7 +257,10 @@ struct Work {
             for (int s = 0; s < SLOTS_CARRY; ++s)
                 for (int64_t e = 0; e < out[s].entries; ++e, from += room) {
                     REAL *to = out_data[s] + first * out[s].row + e * out[s].entry;
-                    for (int r = 0; r < f.rows; ++r) to[r * out[s].row] = from[r];
+                    if (out[s].row == 1)
+                        copy(from, f.rows, to);
+                    else
+                        for (int r = 0; r < f.rows; ++r) to[r * out[s].row] = from[r];
                 }
         }
         wait_for_streams();

@@ -243,6 +243,34 @@ def test_loops_and_what_is_cut_have_the_gradients_of_the_definition(
     assert "plain torch" not in caplog.text
 
 
+GRAM, SCALE = nn.Parameter(0.05 * drawn(15, 15)), nn.Parameter(1 + 0.1 * drawn(15))
+
+
+def descent(weights: Tensor, target: Tensor, _: Tree) -> tuple[Tensor, Tensor]:
+    """Steepest descents, in one pass as in a chase of 15 centers, of which each pass squares and divides."""
+
+    def passed(given: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+        found, slope = given
+        image = slope + SCALE * (((SCALE * slope) @ GRAM.mT).sin() - (slope @ GRAM).cos())
+        length = 0.1 / (1.0 + slope.square().sum(-1) + (slope * image).square().sum(-1))
+        return found + 0.5 * length.unsqueeze(-1) * slope, slope - length.unsqueeze(-1) * image
+
+    start = target.repeat(1, 5) - weights - SCALE * (weights @ GRAM.mT)
+    after = lanes.repeat(10, passed, (weights, start))[0]
+    return 0.3 * after, after.square()
+
+
+@pytest.mark.parametrize(("rows", "times"), [(1, 11), (9, 1), (9, 40), (70, 7)])
+def test_long_steps_and_inputs_of_times_in_any_layout(rows: int, times: int) -> None:
+    program = lanes.Program(descent)
+    dense, weights = drawn(rows, times, 3).requires_grad_(), drawn(rows, 15).requires_grad_()
+    apart = drawn(rows, 3, times).mT.detach().requires_grad_()
+    for target in (dense, apart, dense[:, ::2]):
+        given = weights, target, ()
+        found = gradients(program, given, GRAM, SCALE)
+        close(found, gradients(program.definition, given, GRAM, SCALE), tolerance=1e-10)
+
+
 def test_a_gradient_that_rounding_has_overgrown_names_its_first_row_once(
     caplog: pytest.LogCaptureFixture,
 ) -> None:

@@ -13,8 +13,8 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import ClassVar
 
-from ..trace.graph import FLAG, IN_PLACE, NARROW, NOW, REAL, ROW, STEP, WHOLE, Graph
-from .schedule import Schedule, Sizes
+from ..trace.graph import FIXED, FLAG, IN_PLACE, NARROW, NOW, REAL, ROW, STEP, WHOLE, Graph
+from .schedule import Schedule, Sizes, evenly
 from .tables import TableWriter, Text
 
 _FEW = 400  # nodes of a program of which two vectors fit the registers and caches side by side
@@ -294,6 +294,50 @@ class _CppWriter(TableWriter):
         if of_minus and graph.type[node] != NARROW:
             return f"exp_of_minus({self._ref(graph.args[graph.args[node][0]][0], j)})"
         return super()._expression(node, j)
+
+    def _collected_places(self, number: int) -> dict[int, str]:
+        graph, loop, found = self.graph, self.graph.loops[number], dict[int, str]()
+        body = set(self.schedule.body(number))
+        packs = {graph.args[node]: node for node in body if graph.op[node] == "pack"}
+        for k in sorted(self.schedule.collected(number)):
+            part = tuple(loop.collected[k])
+            array = graph.args[part[0]][0] if graph.op[part[0]] == "elem" else packs.get(part, -1)
+            entries = [("elem", (array,), e) for e in range(len(part))]
+            whole = part in packs or [(graph.op[e], graph.args[e], graph.aux[e]) for e in part] == entries
+            if array in body and whole and graph.size(array) == len(part):
+                found.setdefault(array, f"y{number}_{k}")
+        return found
+
+    def _panels(self, node: int) -> None:
+        """Products with a matrix of the table by a function of their own, which has all registers."""
+        graph, (outs, count, *places) = self.graph, self.graph.aux[node]
+        known = [self._is_constant(a) for a in graph.args[node]]
+        indices = [evenly(place, [outs, count]) for place in places]
+        matrix, vector = (0, 1) if known[0] else (1, 0)
+        (by, at), x = (indices[matrix], indices[vector]), graph.args[node][vector]
+        if (
+            self.copies > 1
+            or not known[matrix]
+            or by is None
+            or at is None
+            or at[0][0]
+            or not self._has_name(x)
+        ):
+            return super()._panels(node)
+        (row, step), first = by
+        sizes = ", ".join(map(str, (outs, count, row, step, at[0][1])))
+        table = f"c + {self._entries_of(graph.args[node][matrix]) + first}"
+        return self._line(f"products<{sizes}>({table}, {self._name(x)} + {at[1]}, a{node});")
+
+    def _is_constant(self, array: int) -> bool:
+        graph = self.graph
+        return graph.op[array] == "pack" and all(graph.op[a] in FIXED for a in graph.args[array])
+
+    def _has_name(self, array: int) -> bool:
+        """Return whether an array of numbers lies in memory of its own."""
+        elsewhere = array in self._remade or array in self._stored or array in self._taken_over
+        real = self.graph.type[array] == REAL and self._is_array(array)
+        return real and not elsewhere and self._in_place(array) is None
 
     def _nobody(self, mask: int) -> str:
         return f"!any({' | '.join(self._ref(mask, j) for j in range(self.copies))})"

@@ -78,6 +78,8 @@ class StatementWriter(abc.ABC):
         self._in_memory: set[int] = set()  # slots of the carry that are arrays
         self._taken_over: set[int] = set()  # maps that are computed where they are read, once
         self._remade: set[int] = set()  # maps that are, however often
+        self._there: set[str] = set()  # what loops collect without a copy
+        self._collected_in: dict[int, str] = {}  # arrays that are written where a loop collects them
         self._starts = {
             "row": np.cumsum([0, *layout.rows]).tolist(),
             "now": np.cumsum([0, *layout.nows]).tolist(),
@@ -198,11 +200,13 @@ class StatementWriter(abc.ABC):
             self._line(f"{kind} y{number}_{k}[{size * self.copies}];")
         with self._braces(f"for (int i{number} = 0; i{number} < {loop.count}; ++i{number})"):
             body = self.schedule.body(number)
+            self._collected_in |= self._collected_places(number)
             if loop.going >= 0:
                 self._block([node for node in body if node <= loop.going])
                 self._line(f"if ({self._nobody(loop.going)}) break;")
             self._block([node for node in body if node > loop.going])
-            for k in sorted(self.schedule.collected(number)):
+            copied = {k for k in self.schedule.collected(number) if f"y{number}_{k}" not in self._there}
+            for k in sorted(copied):
                 size = len(loop.collected[k])
                 for e, node in enumerate(loop.collected[k]):
                     for j in range(self.copies):
@@ -212,6 +216,10 @@ class StatementWriter(abc.ABC):
             for k in arrays:
                 if loop.following[k] != loop.carry[k]:
                     self._copy_array(f"l{number}_{k}", loop.following[k])
+
+    def _collected_places(self, number: int) -> dict[int, str]:
+        """The arrays of a pass that a loop collects, and where, if a back end has no copies of them."""
+        return {}
 
     def _copy_array(self, name: str, array: int) -> None:
         size = self.graph.size(array)
@@ -299,7 +307,13 @@ class StatementWriter(abc.ABC):
         return self._operation(op, values, self.graph.type[node])
 
     def _declare(self, node: int) -> None:
-        self._line(f"{self._type(node)} a{node}[{self.graph.size(node) * self.copies}];")
+        kind, size = self._type(node), self.graph.size(node) * self.copies
+        if node not in self._collected_in:
+            return self._line(f"{kind} a{node}[{size}];")
+        whole = self._collected_in[node]
+        self._there.add(whole)
+        number = whole[1:].partition("_")[0]
+        return self._line(f"{kind} *const a{node} = {whole} + i{number} * {size};")
 
     def _sum(self, names: Sequence[str], strides: Sequence[int], start: int) -> str:
         terms = [n if s == 1 else f"{n} * {s}" for n, s in zip(names, strides, strict=True) if s]
@@ -370,11 +384,15 @@ class StatementWriter(abc.ABC):
             return self._state(slot, self._sum([f"({at})"], [1], place[1]), j)
         if place is not None:
             return self._typed(array, self._buffer(*place, j, at))
-        name = f"a{array}"
+        name = self._name(array)
+        return f"{name}[{at}]" if self.copies == 1 else f"{name}[({at}) * {self.copies} + {j}]"
+
+    def _name(self, array: int) -> str:
+        graph = self.graph
         if graph.op[array] in ("collect", "carrys", "results"):
             number, k, _ = graph.aux[array]
-            name = f"{'y' if graph.op[array] == 'collect' else 'l'}{number}_{k}"
-        return f"{name}[{at}]" if self.copies == 1 else f"{name}[({at}) * {self.copies} + {j}]"
+            return f"{'y' if graph.op[array] == 'collect' else 'l'}{number}_{k}"
+        return f"a{array}"
 
     def _made_again(self, node: int, at: str, j: int) -> str:
         """The expression of an entry of a map that is not kept."""

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..emit.schedule import evenly
 from .graph import FLAG, REAL, STEP, WHOLE, Loop
-from .slopes import slopes_of
+from .slopes import signs_last, slopes_of
 from .step_copy import NoReverseError, StepCopy, collected, entry
 from .tracer import LARGE
 
@@ -48,7 +48,8 @@ class Reverse:
         self._single: dict[int, dict[int, int]] = {}
         self._ends: dict[int, dict[int, int]] = {}  # by the results of a loop
         self._outs: dict[int, dict[int, int]] = {}  # by what it collects
-        self._around: dict[int, int] | None = None  # in a loop: by numbers outside of it
+        self._around: dict[int, int] | None = None  # in a loop: by numbers outside of it, added up by passes
+        self._sums = 0, 0  # in a loop: its number, and where those sums begin in its carry
         self._arrays_around: dict[int, list[int]] = {}
         self._zero, self._one = self._graph.constant(0.0, REAL), self._graph.constant(1.0, REAL)
         self._found: dict[tuple[str, int], dict[int, int]] = {slot: {} for slot in slots}
@@ -133,6 +134,9 @@ class Reverse:
         outside = self._around is not None and self._graph.depth[node] <= STEP
         slopes = self._around if outside and self._around is not None else self._slope
         before = slopes.get(node)
+        if before is None and outside:  # the sum of the passes so far, so that products are added to it
+            number, first = self._sums
+            before = self._graph.add("carry", (), REAL, (number, first + len(slopes)), STEP + 1)
         slopes[node] = slope if before is None else self._graph.apply("add", before, slope)
 
     def _give_whole(self, array: int, slopes: int) -> None:
@@ -214,10 +218,9 @@ class Reverse:
             return None
         wanted = [self._active[a] for a in args]
 
-        def apply(op: str, *args: int) -> int:
-            return graph.where(*args) if op == "where" else graph.apply(op, *args)
-
-        read, out = [*map(self._value, args)], self._value(node)
+        apply, read, out = signs_last(graph), [*map(self._value, args)], self._value(node)
+        if op == "mul" and args[0] == args[1]:  # what slopes of many squares have in common is doubled once
+            return self._give(args[0], apply("mul", apply("mul", slope, graph.constant(2.0, REAL)), read[0]))
         slopes = slopes_of(op, slope, read, out, wanted, apply, lambda x: graph.constant(x, REAL))
         for argument, one in zip(args, slopes, strict=True):
             if one is not None:
@@ -286,7 +289,7 @@ class Reverse:
         places = [k for k, one in enumerate(moving) if one]
         slopes = [graph.add("carry", (), REAL, (number, j), depth) for j in range(len(places))]
         self._values = self._step.held(self._step.kept[node], number, range(first, end))
-        self._around, self._arrays_around = {}, {}
+        self._around, self._arrays_around, self._sums = {}, {}, (number, len(slopes))
         for k, slope in zip(places, slopes, strict=True):
             self._give(after[k], slope)
         for part, array in outs.items():
@@ -300,8 +303,7 @@ class Reverse:
         ]
         back.initial = [ends.get(k, self._zero) for k in places] + [self._zero] * len(around)
         back.following = [self._slope.get(earlier[k], self._zero) for k in places]
-        sums = zip(back.carry[len(slopes) :], around.values(), strict=True)
-        back.following += [graph.apply("add", total, slope) for total, slope in sums]
+        back.following += around.values()
         fed = [
             k for k in range(first, end) if graph.op[k] == "load" and k in self._slope and k not in earlier
         ]

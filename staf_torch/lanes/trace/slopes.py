@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
+from .graph import Graph
 from .step_copy import NoReverseError
 
 Apply = Callable[..., Any]
@@ -12,6 +13,21 @@ Apply = Callable[..., Any]
 
 def _no_slope() -> Any:
     raise NoReverseError("an exponent that has a slope")
+
+
+def signs_last(graph: Graph) -> Callable[..., int]:
+    """Return the operations of a graph that take the sign out of a product, for a sum to take it along."""
+
+    def apply(op: str, *args: int) -> int:
+        if op == "where":
+            return graph.where(*args)
+        signs = sum(graph.op[a] == "neg" for a in args)
+        if op != "mul" or not signs:
+            return graph.apply(op, *args)
+        product = graph.apply("mul", *(graph.args[a][0] if graph.op[a] == "neg" else a for a in args))
+        return product if signs == 2 else graph.apply("neg", product)
+
+    return apply
 
 
 def slopes_of(
