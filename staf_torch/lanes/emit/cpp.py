@@ -315,14 +315,8 @@ class _CppWriter(TableWriter):
         indices = [evenly(place, [outs, count]) for place in places]
         matrix, vector = (0, 1) if known[0] else (1, 0)
         (by, at), x = (indices[matrix], indices[vector]), graph.args[node][vector]
-        if (
-            self.copies > 1
-            or not known[matrix]
-            or by is None
-            or at is None
-            or at[0][0]
-            or not self._has_name(x)
-        ):
+        alone = self.copies == 1 and graph.type[node] == REAL and known[matrix] and self._has_name(x)
+        if not alone or by is None or at is None or at[0][0]:
             return super()._panels(node)
         (row, step), first = by
         sizes = ", ".join(map(str, (outs, count, row, step, at[0][1])))
