@@ -14,6 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .call import seen_by_others
+
 _WORD, _HALF = 0xFFFFFFFF, 0xFFFF
 _FACTORS, _WEYL, ROUNDS = (0xD2511F53, 0xCD9E8D57), (0x9E3779B9, 0xBB67AE85), 10
 
@@ -79,6 +81,9 @@ def uniform(seed: Tensor, step: Tensor, count: int) -> Tensor:
         count: of numbers.
     """
     at = step.detach()
+    looked = seen_by_others() or torch._C._len_torch_function_stack() or torch.compiler.is_compiling()
+    if type(at) is Tensor and at.is_cpu and not looked:
+        return _by_numpy(seed.detach(), at, count)
     high = (at / 65536).floor()
     parts = [*seed.detach().unbind(-1), at - 65536 * high, high]
     block = torch.arange((count + 1) // 2, dtype=at.dtype, device=at.device)
@@ -87,6 +92,17 @@ def uniform(seed: Tensor, step: Tensor, count: int) -> Tensor:
         torch.ops.staf_torch.philox(*given, block.expand_as(given[0]), second) for second in (False, True)
     ]
     return torch.stack(both, dim=-1).flatten(-2)[..., :count]
+
+
+def _by_numpy(seed: Tensor, step: Tensor, count: int) -> Tensor:
+    """Return `uniform` where nobody looks at the operations: a plain loop of few rows draws at every step."""
+    parts, at = (each.numpy().astype(np.uint64) for each in (seed, step))
+    key = [parts[..., k : k + 1] + (parts[..., k + 1 : k + 2] << np.uint64(16)) for k in (0, 2)]
+    block = np.arange((count + 1) // 2, dtype=np.uint64)
+    counter = at[..., None], block, np.zeros_like(block), np.zeros_like(block)
+    found = np.stack(_mixed(counter, key, _unsigned_product), axis=-1)
+    whole = (found[..., ::2] << np.uint64(21)) + (found[..., 1::2] >> np.uint64(11))
+    return (_signed(whole) - 2**52).flatten(-2)[..., :count].to(step.dtype) * 2.0**-52
 
 
 def _numbers(halves: Sequence[Tensor], block: Tensor, second: bool) -> Tensor:

@@ -96,7 +96,7 @@ def test_the_size_of_a_loop_is_that_of_its_records(given: dict[str, Any], size: 
 
 def test_walls_have_metrics_of_their_own(tmp_path: Path) -> None:
     walls = ("adp/policy=lqr", "adp.walls.low=[-6,-6]", "adp.walls.high=[6,6]", "adp.walls.decay=1.0")
-    found = run(tmp_path, *SHORT, *walls, "history=false").metrics
+    found = run(tmp_path, *SHORT, *walls, "duration=0.03", "history=false").metrics
     assert found["wall_constraint_violations"] == 0
     assert 0 <= found["wall_acted"] <= 1
     assert [path.name for path in tmp_path.iterdir()] == ["metrics.json"]
