@@ -77,6 +77,8 @@ class StaF(nn.Module):
         if out_features is not None:
             integer("StaF", "out_features", out_features, least=1)
         self.basis = basis
+        if isinstance(batch_shape, int):
+            raise fail("StaF", "batch_shape", f"must be a tuple: write `({batch_shape},)`", batch_shape)
         self.batch_shape, self.out_features = tuple(batch_shape), out_features
         outputs = () if out_features is None else (out_features,)
         like = basis.centers.directions.detach().new_empty((), dtype=dtype, device=device)

@@ -73,7 +73,7 @@ def export_c(
         ValueError: if a name is taken, or given twice, their number is wrong, or an operation of the module
             has no C here.
     """
-    outputs = listed_names("export_c", outputs)
+    path, outputs = Path(path), listed_names("export_c", outputs)
     name = function_name("export_c", name, module, ["state", *outputs])
     checked_names("export_c", "outputs", outputs, ["state"])
     check_dtype("export_c", module, example)

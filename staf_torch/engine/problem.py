@@ -47,8 +47,7 @@ class Problem:
         integer(self.call, "inner_steps", self.inner_steps, least=0)
         object_of(self.call, StaFBasis, "`StaFBasis(kernel, centers)`", basis=self.basis)
         self.basis.check_learned()
-        if not isinstance(self.law, UpdateLaw):
-            raise fail(self.call, "law", "must be an UpdateLaw", self.law)
+        object_of(self.call, UpdateLaw, "`optim.ConjugateGradient()`, for example", law=self.law)
         if self.predictor is not None and not isinstance(self.predictor, Predictor):
             raise fail(self.call, "predictor", "must be a Predictor or None", self.predictor)
 

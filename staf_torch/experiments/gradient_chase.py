@@ -231,7 +231,7 @@ def _summarise(title: Title, metrics: dict[str, float | None]) -> None:
     _log.info("Gradient chase: %s, %d times, dt = %g s, %s", *about)
     if metrics["ultimate_error"] is None:
         end, first = (title.times - 1) * title.dt, f"settle_time = {title.settle_time:g} s"
-        ends = f"the run ends at {end:g} s, and metrics begin at {first}"
+        ends = f"the run ends at {end:g} s, and metrics begin at {first}: give `settle_time=...`"
         why = ends if end < title.settle_time else f"no trajectory is finite at a time t >= {first}"
         _log.warning("nothing to report: %s", why)
     row = "  %-22s %12s %12s %12s"

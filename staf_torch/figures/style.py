@@ -341,7 +341,7 @@ def _label_the_lowest(figure: Figure) -> None:
         looks = [(each.get_xlabel(), each.get_xscale(), each.get_xlim()) for each in (axes, lower)]
         if looks[0] == looks[1]:
             axes.xaxis.label.set_visible(False)
-            axes.tick_params(labelbottom=False)
+            axes.tick_params(labelbottom=False, which="both")
 
 
 def size() -> float:

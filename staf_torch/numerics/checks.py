@@ -145,7 +145,8 @@ def object_of(call: str, kind: type, else_write: str = "", **given: object) -> N
     for name, value in given.items():
         if isinstance(value, kind):
             continue
-        rule = f"must be a {kind.__name__}{else_write and f': {else_write}'}"
+        article = "an" if kind.__name__[0] in "AEIOU" else "a"
+        rule = f"must be {article} {kind.__name__}{else_write and f': {else_write}'}"
         if isinstance(value, type) and issubclass(value, kind):
             rule = f"must be an object, and is the class: write `{value.__name__}(...)`"
         raise fail(call, name, rule, value)

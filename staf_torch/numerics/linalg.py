@@ -58,7 +58,11 @@ def square(call: str, name: str, value: Matrix, size: int) -> Tensor:
         return given.diag() if given.dim() else given * identity
     if isinstance(value, Sequence) and not isinstance(value, str):
         if value and all(isinstance(entry, int | float) for entry in value):
-            given = torch.tensor(vector(call, name, value, len(value)), dtype=torch.float64, device="cpu")
+            if len(value) != size:
+                raise fail(
+                    call, name, f"must have {size} entries of a diagonal, or be ({size}, {size})", value
+                )
+            given = torch.tensor(vector(call, name, value, size), dtype=torch.float64, device="cpu")
             return given.diag()
         rows = [vector(call, name, row, len(value)) for row in value]
         return torch.tensor(rows, dtype=torch.float64, device="cpu")

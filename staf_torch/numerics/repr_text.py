@@ -55,7 +55,7 @@ def limits(bounds: Any) -> list[str]:
 
 def span(values: Tensor) -> str:
     """Return `0.1 to 0.7` of the finite ones, `none found` where there are none."""
-    finite = values[torch.isfinite(values)]
+    finite = values.detach()[torch.isfinite(values)]
     if not len(finite):
         return "none found"
     low, high = float(finite.min()), float(finite.max())

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from ..lanes.each_row import each_row
 from . import show
+from .checks import fail
 
 _known: weakref.WeakKeyDictionary[Any, set[Any]] = weakref.WeakKeyDictionary()  # targets that were tried
 _COUNTS = (5, 7, 11, 13, 17, 19, 23, 29, 31, 37)
@@ -71,7 +72,7 @@ def check_rows(
             said = str(error).splitlines()[0] if str(error) else ""
             sized = "size" in said or "shape" in said
             hint = " Numbers of a row's own stand in `staf_torch.rows`." if sized else ""
-            hint = " A network in float32 needs `.double()`." if "dtype" in said else hint
+            hint = _of_precision(given[0].dtype) if "dtype" in said else hint
             raise ValueError(f"{told}; it raised {type(error).__name__} ({said}).{hint}") from error
         finally:
             torch.set_rng_state(random)  # a function that draws numbers draws the same ones afterwards
@@ -81,6 +82,13 @@ def check_rows(
             raise ValueError(f"{told}; got {tuple(found.shape)}.")
         if not found.is_floating_point():
             raise ValueError(f"{told}, of floating point; got {found.dtype}.")
+
+
+def _of_precision(dtype: torch.dtype) -> str:
+    """Return how a function and rows in different precisions come together."""
+    if dtype == torch.float32:
+        return " The states are in float32: a network in float64 needs them `.double()`."
+    return " A network in float32 needs `.double()`."
 
 
 def once(function: Any, kind: Hashable, check: Callable[[], None]) -> None:
@@ -115,6 +123,8 @@ def check_target(
     """
 
     def check() -> None:
+        if not callable(target):
+            raise fail("StaFBasis", "target", "must be a function of points (..., n)", target)
         name = getattr(target, "__name__", type(target).__name__)
         form, inner = ("(...)", ()) if outputs is None else (f"(..., {outputs})", (outputs,))
         rule = (

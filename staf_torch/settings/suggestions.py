@@ -21,7 +21,8 @@ def without_setting(name: str) -> str:
     known = _settings()
     if choices := known.get(name):
         shown = ", ".join(choices[:4]) + (", ..." if len(choices) > 4 else "")
-        return f"there is no setting `{name}` with these choices; {shown} has it."
+        have = "has" if len(choices) == 1 else "have"
+        return f"there is no setting `{name}` with these choices; {shown} {have} it."
     if name in known:
         whole = name.partition(".")[0]
         return f"`{name}` cannot be set where `{whole}` is one value: omit `{whole}=...`."

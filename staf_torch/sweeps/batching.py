@@ -238,6 +238,9 @@ def sentence(error: BaseException) -> str:
     if isinstance(error, MissingConfigException) and error.options:
         name = (error.missing_cfg_file or "").removesuffix(".yaml")
         return without_option(name, error.options)
+    missing = re.match(r"Missing mandatory value: (\S+)", str(error))
+    if missing:
+        return f"`{missing[1]}` has no default here: give `{missing[1]}=...`."
     several = re.match(r"Ambiguous value for argument '([^=]+)=(.*)'", str(error))
     if several:
         line = f"{several[1]}={several[2]}"

@@ -104,7 +104,7 @@ def facts(directory: Path, found: Collection) -> dict[str, str]:
     """Return what makes runs repeatable: command, date, machine, versions, and the units of the plant."""
     sweep = read(directory / SWEEP) or {}
     typed = [part for name in ("overrides", "hydra") if isinstance(part := sweep.get(name), list)]
-    words = [str(word) for part in typed for word in part]
+    words = [str(word) for part in typed for word in part if not str(word).startswith("hydra.mode=")]
     began = sorted(run.began for run in found.rows if run.began)
     builds = _all(run.build for run in found.rows) or _all(run.version for run in found.rows)
     python = _all(run.python for run in found.rows)
@@ -119,7 +119,8 @@ def facts(directory: Path, found: Collection) -> dict[str, str]:
         "units": _all(", ".join(f"{name} {unit}" for name, unit in run.units.items()) for run in found.rows),
     }
     return {
-        name: text or ("none declared" if name == "units" else "not recorded") for name, text in told.items()
+        name: text or ("none: the plant declares none" if name == "units" else "not recorded")
+        for name, text in told.items()
     }
 
 

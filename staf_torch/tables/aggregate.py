@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import functools
 import math
 import statistics
@@ -185,7 +186,7 @@ def _starts_alone(runs: Sequence[RecordedRun]) -> bool:
 
 
 def _check(found: Collection, layout: Layout) -> None:
-    settings = sorted(found.keys)
+    settings = sorted(set(found.keys))
     for option, names, known in (
         ("rows", layout.rows, settings),
         ("columns", layout.columns, settings),
@@ -194,11 +195,14 @@ def _check(found: Collection, layout: Layout) -> None:
     ):
         for name in names:
             if name not in known:
-                raise fail(TABLE_COMMAND, option, _one_of(known), name)
+                raise fail(TABLE_COMMAND, option, _one_of(known, name), name)
 
 
-def _one_of(known: Sequence[str]) -> str:
-    return f"must be one of {', '.join(known)}" if known else "cannot be chosen: no run has any"
+def _one_of(known: Sequence[str], name: str) -> str:
+    """Return the rule of a name: one of those that are known, the near ones first."""
+    near = [each for each in known if each.endswith(f".{name}")] or difflib.get_close_matches(name, known)
+    order = dict.fromkeys((*near, *known))
+    return f"must be one of {', '.join(order)}" if known else "cannot be chosen: no run has any"
 
 
 def _metrics(found: Collection, every: bool) -> tuple[str, ...]:
@@ -333,7 +337,7 @@ def _column(table: Table, name: str) -> tuple[str, bool]:
     for column in sorted(table.columns, key=lambda column: column.name != name):
         if name in (column.name, column.metric):
             return column.name, column.larger_is_better
-    raise fail(TABLE_COMMAND, "sort", _one_of(table.names), name)
+    raise fail(TABLE_COMMAND, "sort", _one_of(table.names, name), name)
 
 
 def _there(value: Value) -> bool:

@@ -331,7 +331,7 @@ BAD: dict[str, tuple[str, tuple[str, ...]]] = {
     "unknown group": ("sytem=pendulum", ("did you mean `system`?",)),
     "key of another choice": (
         "kernel.width=0.5",
-        ("`kernel.width` with these choices; ", "kernel=gaussian has it."),
+        ("`kernel.width` with these choices; ", "kernel=gaussian have it."),
     ),
     "swept choices of which one has a key": (
         "-m kernel=gaussian,custom kernel.path=a.B",

@@ -209,7 +209,7 @@ class _Law(SteepestDescent):
         ({"states": [[[0.0, 0.0]]]}, "`chase(states=...)` must be a tensor"),
         ({"inner_steps": -1}, "`chase(inner_steps=...)` must be at least 0; got -1."),
         ({"inner_steps": 1.0}, "`chase(inner_steps=...)` must be an integer; got 1.0."),
-        ({"law": _Law}, "`chase(law=...)` must be an UpdateLaw"),
+        ({"law": _Law}, "`chase(law=...)` must be an object, and is the class: write `_Law(...)`"),
         ({"weights": uniform(4)}, "`chase(weights=...)` must have 3 entries in its last dimension"),
         ({"weights": uniform(3, 3)}, "`chase(weights=...)` must have the shape (3,) or (2, 3); got (3, 3)."),
         (

@@ -50,9 +50,23 @@ def check_plant(plant: Plant) -> None:
     name, x, u = type(plant).__name__, plant.equilibrium(), plant.resting_input()
     if isinstance(plant, ControlAffineSystem):
         check_rows(f"{name}.drift", plant.drift, [x], (len(x),), sizes=(len(u),))
+        _check_torch(name, plant, x)
         check_rows(f"{name}.effectiveness", plant.effectiveness, [x], (len(x), len(u)))
     else:
         check_rows(f"{name}.motion", plant.motion, [x, u], (len(x),))
+
+
+def _check_torch(name: str, plant: ControlAffineSystem, x: Tensor) -> None:
+    """Refuse a drift that leaves torch: it is differentiated."""
+    try:
+        with torch.enable_grad():
+            plant.drift(x.detach()[None].requires_grad_())
+    except RuntimeError as error:
+        if "numpy()" in str(error):
+            raise ValueError(
+                f"`{name}.drift` must be of torch's operations, as it is differentiated, and calls NumPy: "
+                "`systems.RatePlant` and `systems.StepPlant` take a function in NumPy."
+            ) from error
 
 
 def _check_spread(plant: Plant) -> None:

@@ -394,7 +394,10 @@ def test_a_state_dict_has_the_matrices_and_not_what_follows_from_bounds() -> Non
         ({"output": lambda x: x.sum(-1)}, r"must map rows \(5, 2\) to \(5, 1\), .*; got \(5,\)"),
         ({"low": 1.0, "high": 1.0}, "must be below high"),
         ({"low": [0.0, 1.0, 2.0]}, r"`Bounds\(low=...\)` must be a number or one for each"),
-        ({"state": [1.0, 2.0, 3.0]}, r"`QuadraticCost\(state=...\)` must be \(2, 2\)"),
+        (
+            {"state": [1.0, 2.0, 3.0]},
+            r"`QuadraticCost\(state=...\)` must have 2 entries of a diagonal, or be \(2, 2\)",
+        ),
         ({"state": [[1.0, 2.0], [3.0]]}, r"`QuadraticCost\(state=...\)` must have 2 entries"),
     ],
 )

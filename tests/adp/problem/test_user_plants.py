@@ -266,3 +266,21 @@ def test_a_spread_is_one_number_or_one_a_coordinate() -> None:
     for wrong in ([1.0, 2.0, 3.0], [1.0, -1.0], "wide", None, [1.0, math.nan]):
         with pytest.raises(ValueError, match=r"`Linear\(spread=...\)` must be one positive number, or one"):
             near(wheel(wrong))
+
+
+class InNumPy(systems.ControlAffineSystem):
+    """A drift that can be evaluated and not differentiated."""
+
+    dim, inputs = 1, 1
+
+    def drift(self, x: torch.Tensor) -> torch.Tensor:
+        return torch.as_tensor(np.sin(x.numpy()))
+
+    def effectiveness(self, x: torch.Tensor) -> torch.Tensor:
+        return torch.ones_like(x).unsqueeze(-1)
+
+
+def test_a_drift_in_numpy_is_told_of_the_doors_for_it() -> None:
+    cost = adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1)
+    with pytest.raises(ValueError, match=r"`InNumPy.drift` must be of torch's operations.*StepPlant"):
+        adp.near_optimal(InNumPy(), cost, dt=0.02, reach="local")
