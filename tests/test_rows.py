@@ -336,7 +336,9 @@ def test_rows_whose_brakes_hold_and_rows_whose_brakes_do_not_stand_behind_one_fi
             for at, those in zip(x[:, row : row + 1], found, strict=True):
                 for got, want in zip(those, one.restrain(at, one.controller.policy(at)), strict=True):
                     assert torch.equal(got[row : row + 1], want)
-    assert [one.follows for one in singles] == [False, True, True]  # two kinds, that are one program
+    alone = [deploy.policy_of(many, row=row) for row in range(FEW)]
+    for those in (singles, [policy.filter for policy in alone]):  # two kinds, that are one program
+        assert [one.follows for one in those] == [False, True, True]
     assert any(bool((each.slack > 0).any()) for each in found)
 
 

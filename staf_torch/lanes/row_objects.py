@@ -433,6 +433,9 @@ def row_of(value: Some, row: int) -> Some:
     if len(getattr(value, "kinds", ())) and isinstance(kind := getattr(value, "kind", None), RowNumbers):
         value = value.kinds[int(kind.full[row])]  # type: ignore[attr-defined]
     found: Some = _Alone([torch.tensor([row], dtype=torch.int64, device="cpu")]).of([value], "")
+    for part in found.modules() if isinstance(found, nn.Module) else ():
+        if isinstance(decide := getattr(part, "decide", None), MethodType):
+            decide()  # by its own numbers, as if it had been made of them
     return found
 
 

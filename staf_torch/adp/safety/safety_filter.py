@@ -209,6 +209,17 @@ class SafetyFilter(Controller):
         made.work = max(float(kind.object.work) for kind in kinds)
         return made
 
+    def decide(self) -> None:
+        """Decide what rows had as numbers of their own, of a copy that has those of one row."""
+        of, ahead = self.conditions, self.ahead
+        if of.frail is None or ahead.frail is None:
+            return
+        of.weak, ahead.weak = tuple((of.frail > 0).tolist()), bool(ahead.frail > 0)
+        of.frail = ahead.frail = None
+        self.follows = ahead.by_policy = ahead.by_policy and ahead.weak
+        if not self.follows:
+            self.work = _BRAKING
+
     @property
     def decay(self) -> Tensor:
         """1/s, one a constraint."""
