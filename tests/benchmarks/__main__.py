@@ -68,6 +68,14 @@ PARTS = {
         {f"error on the ball, M = {m}, r = 0.1": rf"\| +{m} +\| +\**{NUMBER}" for m in (3, 6, 10, 15)},
         1,
     ),
+    "choosing": Part(
+        bench("choosing.py"),
+        {
+            "numbers in the tables of CHOOSING.md and CHOOSING_LAWS.md": rf"^all tables: \d+ of {NUMBER}",
+            "those that their commands give again to three digits": rf"^all tables: {NUMBER}",
+        },
+        4,
+    ),
     "far": Part(
         "staf experiment=ablation kernel=exponential,gaussian 'initial_state=[20.0,0.0]' centers.radius=0.1 "
         "centers.count=6 seed=0",
