@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..lanes.call import readable
 from ..lanes.gradients import refuse_gradient
 from ..numerics.checks import fail
 
@@ -69,13 +70,11 @@ def in_place(value: Any, dtype: torch.dtype | None, shape: tuple[int, ...]) -> b
     """Return whether compiled code can read a sample where it lies, as one of this dtype and shape."""
     try:
         return (
-            type(value) is Tensor
+            readable(value, True)
             and value.dtype is dtype
             and value.shape == shape
             and value.is_cpu
-            and not value.requires_grad
             and value.is_contiguous()
-            and not value.is_neg()
         )
     except RuntimeError:  # a nested tensor has no shape
         return False
