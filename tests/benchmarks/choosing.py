@@ -28,7 +28,7 @@ def tables(page: str) -> Iterator[tuple[list[str], list[float]]]:
     text = (ROOT / "staf_torch" / "approximation" / page).read_text(encoding="utf-8")
     for found in SHOWN.finditer(text):
         labels = [i for i, head in enumerate(found[2].split("|")) if head.strip() == "M"]
-        rows = [row.strip("|").split("|") for row in found[3].splitlines() if "order" not in row]
+        rows = [row.strip("|").split("|") for row in found[3].splitlines() if not row.startswith("| order")]
         cells = [cell for row in rows for i, cell in enumerate(row) if i and i not in labels]
         numbers = [number for cell in cells for number in re.findall(r"^ *([\d.]+(?:e[-+]?\d+)?) *$", cell)]
         yield found[1].splitlines(), [float(number) for number in numbers]
