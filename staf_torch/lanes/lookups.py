@@ -18,6 +18,7 @@ OF_PYTHON = frozenset(sys.stdlib_module_names) - {"__main__"}
 _FOLDERS = tuple(Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib", "purelib", "platlib"))
 _PACKAGES = frozenset(("site-packages", "dist-packages"))
 _SIMPLE = (int, float, complex, str, bytes, tuple, list, dict, set, frozenset, Tensor)
+_WRITTEN = 1 << 9  # Py_TPFLAGS_HEAPTYPE: made by a `class` statement
 EMPTY = object()
 """In a cell whose name has no value yet, and in place of a global that is gone."""
 
@@ -94,19 +95,24 @@ def attribute_parts(name: str, value: Any) -> Iterable[Any]:
 def installed(module: str) -> bool:
     """Return whether a module's code stands: this library's, Python's own, what lies in a folder of packages.
 
-    What is left is a user's: a script, a notebook, files beside it.
+    What is left is a user's: a script, a notebook, files beside it. ``__main__`` is, whatever file it names:
+    `python -m cProfile script.py` runs a script in a namespace of this name, and the module is the profiler.
     """
     root = module.partition(".")[0]
-    if root == _PACKAGE or root in OF_PYTHON or root.startswith("namedtuple_"):
+    if root == _PACKAGE or root.startswith("namedtuple_"):
         return True
     file = getattr(sys.modules.get(module), "__file__", None)
-    if file is None:
-        return False
+    if root == "__main__" or file is None:
+        return root in OF_PYTHON
     path = Path(file)
-    return bool(_PACKAGES & set(path.parts)) or any(path.is_relative_to(folder) for folder in _FOLDERS)
+    if any(path.is_relative_to(folder) for folder in _FOLDERS) or _PACKAGES & set(path.parts):
+        return True
+    return root in OF_PYTHON and any(part.endswith(".zip") for part in path.parts)  # not a user's `code.py`
 
 
 def is_users(value: FunctionType | type) -> bool:
     """Return whether a function or a class is of a user, and may read what changes between two calls."""
     module = value.__globals__.get("__name__") if isinstance(value, FunctionType) else value.__module__
+    if module == "builtins" and isinstance(value, type):  # of text that was run in a namespace without a name
+        return bool(value.__flags__ & _WRITTEN)
     return not (isinstance(module, str) and installed(module))

@@ -8,6 +8,7 @@ moving the inputs by a few units in the last place. No code is read: what a func
 
 from __future__ import annotations
 
+import math
 import random
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -27,6 +28,9 @@ from .tree import Shared, Tree, flatten, plain, unflatten
 _BITS = (1, -1, 3, -5, 17)  # units in the last place by which inputs are moved
 _NEARBY = (0.1, 1e-3)  # of an input and of 1: points beside those that are given
 _CLOSE = 1e-2  # of the largest entry: far above what another order of sums does to an ill-conditioned row
+_SUMMED = 1e3  # roundings of the largest product in a sum, by which another order may change it
+_PRODUCTS = frozenset(("matmul", "__matmul__", "__rmatmul__", "mm", "bmm", "mv", "dot", "inner", "linear",
+                       "einsum", "tensordot", "vecdot", "addmm", "addmv", "baddbmm"))  # fmt: skip
 
 
 def doubt(step: Callable[..., Any], given: Given, *, again: bool = True) -> str | None:
@@ -101,8 +105,8 @@ def _cancelled(
     """Return whether leaves of a row differ as they are zero but for rounding, which no last bit of a zero
     moves: a variance at a point that is known.
 
-    They differ by less than half the digits of what the step computes with, and not at all at points nearby.
-    What looks at other rows does so there, too.
+    They differ by less than half the digits of what the step computes with, or by few roundings of what a
+    product of matrices sums up, and not at all at points nearby. What looks at other rows does so there, too.
     """
     if len(alone) != len(beside):
         return False
@@ -112,7 +116,8 @@ def _cancelled(
         if alone[k].shape != beside[k].shape or not alone[k].is_floating_point():
             return False
         change = float((alone[k] - beside[k]).abs().nan_to_num(0.0).max())
-        if change > torch.finfo(alone[k].dtype).eps ** 0.5 * seen.size:
+        eps = torch.finfo(alone[k].dtype).eps
+        if change > max(eps**0.5 * seen.size, _SUMMED * eps * seen.summed):
             return False
     rest = [*differ]
     for share in _NEARBY:
@@ -132,22 +137,31 @@ def _cancelled(
 
 
 class _Largest(TorchFunctionMode):
-    """Context: the size of the largest number that torch computes inside of it."""
+    """Context: the sizes of the largest number that torch computes inside of it, and of the largest product
+    that it sums up in one operation, a matrix' by a vector's, of which only the sum is seen."""
 
     size = 0.0
+    summed = 0.0
 
     def __torch_function__(
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
     ) -> Any:
         out = func(*args, **(kwargs or {}))
-        for part in (out,) if isinstance(out, Tensor) else out if type(out) in (tuple, list) else ():
-            while isinstance(part, Tensor) and torch._C._functorch.is_functorch_wrapped_tensor(part):
-                part = torch._C._functorch.get_unwrapped(part)
-            if isinstance(part, Tensor) and part.is_floating_point() and part.numel():
-                with torch._C.DisableTorchFunction():
-                    size = float(part.detach().abs().nan_to_num(0.0, 0.0, 0.0).max())
-                self.size = max(self.size, size)
+        self.size = max(self.size, *map(_largest, out if type(out) in (tuple, list) else (out,)), 0.0)
+        if getattr(func, "__name__", "") in _PRODUCTS:
+            factors = [part for arg in args for part in (arg if type(arg) in (tuple, list) else (arg,))]
+            self.summed = max(self.summed, math.prod(map(_largest, factors[-2:])))
         return out
+
+
+def _largest(part: Any) -> float:
+    """Return the size of the largest number of a tensor, 0 of anything else."""
+    while isinstance(part, Tensor) and torch._C._functorch.is_functorch_wrapped_tensor(part):
+        part = torch._C._functorch.get_unwrapped(part)
+    if not (isinstance(part, Tensor) and part.is_floating_point() and part.numel()):
+        return 0.0
+    with torch._C.DisableTorchFunction():
+        return float(part.detach().abs().nan_to_num(0.0, 0.0, 0.0).max())
 
 
 @contextmanager

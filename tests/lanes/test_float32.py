@@ -40,7 +40,8 @@ CONSTANTS: dict[str, Callable[[Tensor], Tensor]] = {
     "a buffer": buffer,
     "a half": lambda x: x * torch.tensor([1.0, 0.3]).half(),
     "a quotient": lambda x: (x.float() / 3 - 0.1).abs() * x,
-    "a matrix": lambda x: (x.float() @ torch.tensor([[1.0, 0.2], [0.3, 0.4]])).double(),
+    # One product a sum: how a processor's library rounds between two is its own.
+    "a matrix": lambda x: (x.float() @ torch.tensor([[0.0, 0.2], [0.3, 0.0]])).double(),
     "a long sum": lambda x: x.float().unsqueeze(-1).expand(-1, -1, 60).cumsum(-1).double().sum(-1),
     "a slope": lambda x: torch.func.grad(lambda z: (z * torch.where(z > 0, 1.0, 0.1) * z).sum())(x),
     "rows by vmap": lambda x: torch.func.vmap(lambda z: z * torch.where(z > 0, 1.0, 0.1))(x),
@@ -74,7 +75,7 @@ ROUNDED: dict[str, Operation] = {
     "count": lambda a, b: (a < b).sum(-1, keepdim=True) / 3 + a,
     "extreme": lambda a, b: torch.maximum(a, b).clamp(-1.1, 1.3),
     "stack": lambda a, b: torch.cat((a[:, :1], b[:, 1:].float()), dim=-1),
-    "matrix": lambda a, b: a @ torch.tensor([[0.3, -0.7], [0.9, 0.1]], dtype=a.dtype),
+    "matrix": lambda a, b: a @ torch.tensor([[0.0, -0.7], [0.9, 0.0]], dtype=a.dtype),
     "square": lambda a, b: a**2 - b.square(),
     "floor": lambda a, b: (3 * a).floor() / 7,
     "remainder": lambda a, b: torch.fmod(5 * a, 0.3),

@@ -11,6 +11,7 @@ import pickle
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -143,6 +144,30 @@ def test_a_function_is_computed_with_what_it_reads_at_the_moment(name: str, note
         return
     for program in (of(kept, function), of(kept, function), own):
         right(program, function)
+
+
+@pytest.mark.parametrize("name", ["__main__", "this", None])
+def test_a_script_is_a_users_under_any_name_and_program_that_runs_it(
+    name: str | None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """`python -m cProfile script.py` runs it as ``__main__``, which is the profiler; a file may hide one of
+    Python's; text is run in a namespace without a name."""
+    space: dict[str, Any] = {} if name is None else {"__name__": name}
+    if name is not None:
+        module = ModuleType(name)
+        module.__file__ = pytest.__file__ if name == "__main__" else str(tmp_path / f"{name}.py")
+        monkeypatch.setitem(sys.modules, name, module)
+    space["gain"] = torch.tensor(2.0, dtype=torch.float64)
+    exec("class Own:\n    def __call__(self, x):\n        return x * gain", space)
+    exec("f = lambda x: x * gain", space)
+    kept, functions = SharedPrograms("a test"), (space["f"], space["Own"]())
+    for gain in (2.0, 3.0):
+        space["gain"] = torch.tensor(gain, dtype=torch.float64)
+        for function in functions:
+            right(of(kept, function), function)
+    space["gain"].requires_grad_()
+    for function in functions:
+        assert of(kept, function)(X, steps=1)[1].requires_grad
 
 
 def test_closures_of_equal_content_share_a_program_and_others_do_not(notebook: Any) -> None:
