@@ -156,7 +156,7 @@ class _CWriter(ScalarWriter):
         self, graph: Graph, schedule: Schedule, layout: Sizes, names: Names, table: str, numbers: CTable
     ) -> None:
         super().__init__(graph, schedule, layout, names)
-        self._name, self._numbers = table, numbers
+        self._table_name, self._numbers = table, numbers
         self._places: dict[int, int] = {}  # in the table, of parameters of the graph
         self._packs: dict[int, int] = {}  # of arrays, where they begin
         self._numbered: list[int] = []  # the node of every place
@@ -195,14 +195,14 @@ class _CWriter(ScalarWriter):
         number = self.graph.aux[node]
         if self._wide(node):
             return self._number(self._numbers.values[number], WIDE)
-        return f"{self._name}[{self._places[number]}]"
+        return f"{self._table_name}[{self._places[number]}]"
 
     def _table(self, pack: int, at: str) -> str:
         nodes = self.graph.args[pack]
         if all(self.graph.op[node] == "const" for node in nodes):
             return super()._table(pack, at)
         if (first := self._packs.get(pack)) is not None:
-            return f"{self._name}[{f'{first} + {at}' if first else at}]"
+            return f"{self._table_name}[{f'{first} + {at}' if first else at}]"
         if (name := f"c{pack}") not in self._arrays:  # its numbers lie elsewhere, in another order
             self._arrays.add(name)
             entries = ", ".join(map(self._literal, nodes))
@@ -230,7 +230,7 @@ class _CWriter(ScalarWriter):
         texts = [text[1:-1] if text.startswith("(-") else text for text in texts]
         return [
             *(_ABOUT % {"name": name, "macro": macro}).splitlines(),
-            f"{macro} {self.real} {self._name}[{len(texts)}] = {{",
+            f"{macro} {self.real} {self._table_name}[{len(texts)}] = {{",
             *_commented_rows(texts, said),
             "};",
             "",
