@@ -328,18 +328,17 @@ def test_rows_whose_brakes_hold_and_rows_whose_brakes_do_not_stand_behind_one_fi
         lqr = adp.LQR(plant, adp.QuadraticCost(1.0, 1.0, 2, 1))
         return adp.SafetyFilter(lqr, plant, lambda x, t: x[:, 0] + 0.5, dt=0.1, low=-10.0, high=10.0)
 
-    many, x = safe(st.rows(masses)), torch.cat((x0, 0.5 * x0, x0 - 1.0)).unsqueeze(1).expand(-1, FEW, -1)
+    many, x = safe(st.rows(masses)), torch.cat((x0 - 1.0, x0, 0.5 * x0))
     with lanes.compiling("never"):
         singles = [safe(mass) for mass in masses]
-        found = [many.restrain(at, many.controller.policy(at)) for at in x]
-        for row, one in enumerate(singles):
-            for at, those in zip(x[:, row : row + 1], found, strict=True):
-                for got, want in zip(those, one.restrain(at, one.controller.policy(at)), strict=True):
-                    assert torch.equal(got[row : row + 1], want)
+        found = many.restrain(x, many.controller.policy(x))
+        for row, (at, one) in enumerate(zip(x.split(1), singles, strict=True)):
+            for got, want in zip(found, one.restrain(at, one.controller.policy(at)), strict=True):
+                assert torch.equal(got[row : row + 1], want)
     alone = [deploy.policy_of(many, row=row) for row in range(FEW)]
     for those in (singles, [policy.filter for policy in alone]):  # two kinds, that are one program
         assert [one.follows for one in those] == [False, True, True]
-    assert any(bool((each.slack > 0).any()) for each in found)
+    assert bool((found.slack > 0).any())
 
 
 def test_a_row_without_an_optimum_spoils_no_other_and_says_why() -> None:

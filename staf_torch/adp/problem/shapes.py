@@ -7,6 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from ...lanes.each_row import each_row
 from ...lanes.row_numbers import RowNumbers
 from ...numerics.checks import fail, object_of
 from ...numerics.default_device import device_of
@@ -60,7 +61,7 @@ def _check_torch(name: str, plant: ControlAffineSystem, x: Tensor) -> None:
     """Refuse a drift that leaves torch: it is differentiated."""
     try:
         with torch.enable_grad():
-            plant.drift(x.detach()[None].requires_grad_())
+            each_row(lambda: plant.drift(x.detach()[None].requires_grad_()), 1)
     except RuntimeError as error:
         if "numpy()" in str(error):
             raise ValueError(
