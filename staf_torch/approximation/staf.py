@@ -175,7 +175,7 @@ class StaF(nn.Module):
         """
         self._points("StaF", y, "`StaF.rowwise(y)`")
         x = _wide(self.state)
-        return self.at_offsets(y.to(x.dtype) - x.unsqueeze(-2)).to(y.dtype)
+        return _in(y.dtype, self._values(x, _in(x.dtype, y) - x.unsqueeze(-2)))
 
     def rowwise(self, y: Tensor) -> Tensor:
         """V^ of each batch entry at its own point: (*batch_shape, n) -> batch_shape, or (*batch_shape, k).
@@ -199,8 +199,8 @@ class StaF(nn.Module):
                 f"{tuple(y.shape)}. For P points of every batch entry: `StaF(y)` with y (..., P, n)."
             )
         x = _wide(self.state)
-        offsets = (y.to(x.dtype) - x).unsqueeze(-2)
-        return self.at_offsets(offsets).squeeze(-1 if self.out_features is None else -2).to(y.dtype)
+        values = self._values(x, (_in(x.dtype, y) - x).unsqueeze(-2))
+        return _in(y.dtype, values.squeeze(-1 if self.out_features is None else -2))
 
     def at_offsets(self, z: Tensor) -> Tensor:
         """V^(x + z; x): (..., P, n) -> (..., P), or (..., P, k).
@@ -208,8 +208,12 @@ class StaF(nn.Module):
         For radii near the rounding of x, where y - x has no digits left.
         """
         beside_batch("StaF.at_offsets", "z", z, 2, self.state.shape[:-1], "the coefficients are")
-        x, coefficients = _wide(self.state), self._outputs_first(z.dim() - 2)
-        return self._outputs_last(self.basis.local(x).evaluate(z.to(x.dtype), coefficients)).to(z.dtype)
+        x = _wide(self.state)
+        return _in(z.dtype, self._values(x, _in(x.dtype, z)))
+
+    def _values(self, x: Tensor, z: Tensor) -> Tensor:
+        """V^ at offsets (..., P, n) from the state, all in the precision in which is computed."""
+        return self._outputs_last(self.basis.local(x).evaluate(z, self._outputs_first(z.dim() - 2)))
 
     def value_and_gradient(
         self, y: Tensor, mode: str = "partial", target: Target | None = None
@@ -230,14 +234,14 @@ class StaF(nn.Module):
         choice("StaF.gradient", "mode", mode, _MODES)
         self._points("StaF.gradient", y, "`StaF.gradient(y.unsqueeze(-2)).squeeze(-2)`")
         x = _wide(self.state)
-        given, y = y.dtype, y.to(x.dtype)
+        given, y = y.dtype, _in(x.dtype, y)
         z = y - x.unsqueeze(-2)
         if mode != "partial":
             slope = row_jacobian(self._along(y, z, mode, target), torch.zeros_like(z))[1]
             return self(y).to(given), slope.to(given)
         values: Tensor
         values, gradient = self.basis.local(x).evaluate_with_gradient(z, self._outputs_first(z.dim() - 2))
-        values, gradient = values.to(given), gradient.to(given)
+        values, gradient = _in(given, values), _in(given, gradient)
         if self.out_features is None:
             return values, gradient
         return values.movedim(0, -1), gradient.movedim(0, -2)
@@ -374,6 +378,11 @@ class StaF(nn.Module):
         clone.__dict__.update({name: copy.deepcopy(v, memo) for name, v in held.items()})
         clone._remember(target)
         return clone
+
+
+def _in(dtype: torch.dtype, tensor: Tensor) -> Tensor:
+    """Return a tensor in a precision: `Tensor.to`, which takes a microsecond where it has nothing to do."""
+    return tensor if tensor.dtype == dtype else tensor.to(dtype)
 
 
 def _wide(tensor: Tensor) -> Tensor:
