@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor, nn
+from variants import by_turns
 
 from staf_torch import (
     AnchoredKernel,
@@ -100,8 +101,7 @@ def written_at_run_time(path: Path, numbers: list[float], x: Tensor) -> Tensor:
 
 
 @needs_gcc
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@pytest.mark.parametrize("name", POLICIES)
+@pytest.mark.parametrize(("name", "dtype"), by_turns(POLICIES, [torch.float64, torch.float32]))
 def test_other_numbers_are_another_table_of_the_same_text(
     name: str, dtype: torch.dtype, tmp_path: Path
 ) -> None:
