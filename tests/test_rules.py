@@ -261,6 +261,7 @@ def mixed(**given: Any) -> Any:
     return st.MixtureRegressor(**given).partial_fit(TWO[0], 1.0)
 
 
+PATH = torch.zeros(1, 3, 2, dtype=torch.float64)
 REFUSED: list[tuple[Callable[[], Any], str]] = [
     (lambda: systems.find_equilibrium(PLANT, [0.0, math.nan]), "(x=...)` must be finite"),
     (lambda: systems.Bounds(st.rows(THREE), None, 3), "`Bounds(low=...)` must be the same numbers for all"),
@@ -268,6 +269,11 @@ REFUSED: list[tuple[Callable[[], Any], str]] = [
         lambda: adp.ActorCritic(adp.QuadraticBasis(2), PLANT, COST, POINTS, critic=THREE[0] * math.nan),
         "(critic=...)` must be finite",
     ),
+    (lambda: st.StaF(BASIS, batch_shape=5), "`StaF(batch_shape=...)` must be a tuple: write `(5,)`"),  # type: ignore[arg-type]
+    (lambda: st.chase(PATH, BASIS, PAPER, optim.SteepestDescent), "write `SteepestDescent(...)`"),  # type: ignore[arg-type]
+    (lambda: st.chase(PATH, BASIS, PAPER, "exact"), "must be an UpdateLaw: `optim."),  # type: ignore[arg-type]
+    (lambda: st.chase(PATH, BASIS, None, optim.Exact()), "(target=...)` must be a function of points"),  # type: ignore[arg-type]
+    (lambda: adp.QuadraticCost([1.0] * 3, 1.0, 2, 1), "(state=...)` must have 2 entries of a diagonal, or"),
     (lambda: BASIS(THREE, TWO[0]), "must have 2 entries in its last dimension"),
     (lambda: BASIS.local(THREE), "`StaFBasis.local(x=...)` must have 2 entries"),
     (lambda: STAF.hessian(TWO, mode="no"), "`StaF.hessian(mode=...)` must be one of"),

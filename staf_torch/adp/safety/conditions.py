@@ -106,17 +106,17 @@ class Conditions(nn.Module):
         self.high: Tensor
         x, t = self._around()
         values = self.margins(x, t).unflatten(0, (len(TIMES), _PROBES))
-        self.moving = bool((values != values[:1]).any())
+        self.unknown = [k for k in range(count) if in_any_row(values[..., k].isnan())]
+        self.moving = bool((values.nan_to_num(0.0) != values[:1].nan_to_num(0.0)).any())
         if not self.moving:  # one time says it all
             x, t = x[:_PROBES], t[:_PROBES]
         self.degree = self._degrees(degree, x, t)
         found = _brakes(self, x, t)
         self.braked, self.limited, self.weak = found.braked, found.limited, found.weak
         self.apart = found.apart
-        self.register_buffer("frail", found.frail)
+        for name, numbers in (("frail", found.frail), ("brakes", found.constant), ("usual", found.usual)):
+            self.register_buffer(name, numbers)
         self.frail: Tensor | None  # (k,) 1 where a row's own brakes are weak; None where rows are alike
-        self.register_buffer("brakes", found.constant)
-        self.register_buffer("usual", found.usual)
         self.brakes: Tensor  # (k,)
         self.usual: Tensor  # (k,)
         if decay is None:

@@ -31,6 +31,7 @@ _log = logging.getLogger(__name__)
 INFEASIBLE = 1e-6  # slack, in units of the input, from which on a row counts as infeasible
 _PASSES, _MOST = 2, 8  # linearisations at least, the first at the wanted control; at most, until all is met
 _SOLVED = 1e-6  # of what a wanted control misses, at which it is
+_UNKNOWN = "`SafetyFilter`: constraint %s is NaN at some of the states around the equilibrium that were tried."
 _OPPOSED = (
     "`SafetyFilter`: this filter may fail to keep constraint %s: %s. To keep it, plan instead: "
     "`AvoidanceCost` with `RecedingHorizon`, see adp/safety/README.md. Why: braking along constraint %s "
@@ -173,6 +174,8 @@ class SafetyFilter(Controller):
             self.conditions = Conditions(
                 plant, self.constraints, self.bounds, self.hold, decay, degree, margin
             )
+            if self.conditions.unknown:
+                _log.warning(_UNKNOWN, ", ".join(map(str, self.conditions.unknown)))
             self.degree, self.moving = self.conditions.degree, self.conditions.moving
             heavy = one_or_each("SafetyFilter", "weight", 1.0 if weight is None else weight, plant.inputs)
             positive("SafetyFilter", "weight", heavy)

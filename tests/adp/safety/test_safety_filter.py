@@ -486,3 +486,13 @@ def test_bounds_of_the_plant_hold_where_the_filter_states_none(stated: dict[str,
     plant.bounds = systems.Bounds(-0.3, 0.3, 1)
     shield = adp.SafetyFilter(lambda x: 5.0 + 0 * x[..., :1], plant, wall, dt=0.01, **stated)
     assert shield(tensor([[1.0, 0.0]])).tolist() == [[most]]
+
+
+def test_a_constraint_that_is_not_a_number_somewhere_says_so(caplog: pytest.LogCaptureFixture) -> None:
+    plant = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
+    lqr = adp.LQR(plant, adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1))
+    walls = [lambda x, t: x[:, 0] + 0.5, lambda x, t: (x[:, 0] + 0.5).sqrt()]
+    adp.SafetyFilter(lqr, plant, walls[:1], dt=0.01, low=-3.0, high=3.0)
+    assert "NaN" not in caplog.text
+    adp.SafetyFilter(lqr, plant, walls, dt=0.01, low=-3.0, high=3.0)
+    assert "constraint 1 is NaN at some of the states" in caplog.text
