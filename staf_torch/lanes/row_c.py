@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -15,6 +16,8 @@ from .trace.kept_numbers import kept
 from .trace.step import Step, Traced, trace
 from .trace.tracer import NotLoweredError
 from .tree import labels
+
+_log = logging.getLogger(__name__)
 
 
 class RowC(NamedTuple):
@@ -45,15 +48,19 @@ class RowC(NamedTuple):
         Raises:
             NotLoweredError: if an operation has no scalar form.
         """
+        why = "it has float64 inside of float32"
         for known, names in _spelled(step, parts, make):
             try:
                 traced = _kept(known, given)
-            except NotLoweredError:
+            except NotLoweredError as error:
+                why = str(error)
                 continue
             if not traced.rows and not wide(traced):
                 values = [float(x) for x in traced.recipe.values.tolist()]
                 return cls(traced, given, CTable(values, said(traced.recipe, named_tensors(names))))
-        return cls(trace(step, given, folded=True), given, CTable())
+        traced = trace(step, given, folded=True)
+        _log.warning("C with its numbers in the text, not in a table that can be changed: %s", why)
+        return cls(traced, given, CTable())
 
     def text(self, name: str, outputs: Sequence[str] | None = None, note: str = "") -> str:
         """Return the header, as `Program.c_source`."""

@@ -358,3 +358,12 @@ def test_a_rollout_policy_on_a_device_stays_there() -> None:
     plant, cost = systems.TwoState(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
     policy = adp.RolloutPolicy.of_lqr(plant, cost, steps=2).to("meta")
     assert policy(torch.empty(3, 2, dtype=torch.float64, device="meta")).device.type == "meta"
+
+
+def test_numbers_that_no_table_can_hold_stay_in_the_text_and_the_log_says_so(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    gain = torch.tensor([0.1, 0.2], dtype=torch.float64)
+    program = lanes.Program(lambda x, now, row: (x, (x.double() * gain).sum(-1)))
+    assert "0.2" in program.c_source("f", torch.ones(1, 2))
+    assert "not in a table that can be changed: it has float64 inside of float32" in caplog.text
