@@ -31,7 +31,9 @@ _log = logging.getLogger(__name__)
 INFEASIBLE = 1e-6  # slack, in units of the input, from which on a row counts as infeasible
 _PASSES, _MOST = 2, 8  # linearisations at least, the first at the wanted control; at most, until all is met
 _SOLVED = 1e-6  # of what a wanted control misses, at which it is
-_UNKNOWN = "`SafetyFilter`: constraint %s is NaN at some of the states around the equilibrium that were tried."
+_UNKNOWN = (
+    "`SafetyFilter`: constraint %s is NaN at some of the states around the equilibrium that were tried."
+)
 _OPPOSED = (
     "`SafetyFilter`: this filter may fail to keep constraint %s: %s. To keep it, plan instead: "
     "`AvoidanceCost` with `RecedingHorizon`, see adp/safety/README.md. Why: braking along constraint %s "
