@@ -320,6 +320,16 @@ def test_rows_of_several_kinds_stand_behind_one_filter() -> None:
                 assert torch.equal(got[row : row + 1], want)
 
 
+def test_a_users_controller_may_call_its_methods_as_it_likes() -> None:
+    class Own(adp.LQR):
+        def decide(self, x: Tensor) -> Tensor:
+            return self(x)
+
+    own = Own(systems.Pendulum(mass=st.rows(spread(*MASSES))), adp.QuadraticCost(1.0, 1.0, 2, 1))
+    x = starts(FEW)
+    assert torch.equal(deploy.policy_of(own, row=1)(x[1:2]), own.decide(x)[1:2])
+
+
 def test_rows_whose_brakes_hold_and_rows_whose_brakes_do_not_stand_behind_one_filter() -> None:
     masses, x0 = torch.tensor([0.5, 3.0, 8.0]).double(), torch.tensor([[-0.3, -0.9]]).double()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dis
 import functools
+import os
 import sys
 import sysconfig
 from collections.abc import Iterable, Iterator
@@ -15,7 +16,10 @@ from torch import Tensor
 
 _PACKAGE = __name__.partition(".")[0]
 OF_PYTHON = frozenset(sys.stdlib_module_names) - {"__main__"}
-_FOLDERS = tuple(Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib", "purelib", "platlib"))
+_FOLDERS = (
+    *(Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib", "purelib", "platlib")),
+    Path(os.__file__).parent,  # where links make that another path
+)
 _PACKAGES = frozenset(("site-packages", "dist-packages"))
 _SIMPLE = (int, float, complex, str, bytes, tuple, list, dict, set, frozenset, Tensor)
 _WRITTEN = 1 << 9  # Py_TPFLAGS_HEAPTYPE: made by a `class` statement

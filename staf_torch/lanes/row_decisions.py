@@ -41,6 +41,14 @@ class Alike(NamedTuple):
     together: bool = True
 
 
+class DecidedByRows:
+    """Base of what holds decisions of Python that were made of the numbers of all its rows."""
+
+    def decide_alone(self) -> None:
+        """Decide anew by the numbers of one row, which a copy has: as if it had been made of them."""
+        raise NotImplementedError
+
+
 class _SplitError(BaseException):
     """The signal that rows decide differently.
 

@@ -24,7 +24,7 @@ from torch import Tensor, nn
 
 from .contents import BOUND, Contents, Derived
 from .each_row import beside, spread_rows, tried
-from .row_decisions import at_once, is_of_rows
+from .row_decisions import DecidedByRows, at_once, is_of_rows
 from .row_numbers import RowNumbers, all_rows, in_use, over_rows
 from .tree import Shared, plain
 
@@ -434,8 +434,8 @@ def row_of(value: Some, row: int) -> Some:
         value = value.kinds[int(kind.full[row])]  # type: ignore[attr-defined]
     found: Some = _Alone([torch.tensor([row], dtype=torch.int64, device="cpu")]).of([value], "")
     for part in found.modules() if isinstance(found, nn.Module) else ():
-        if isinstance(decide := getattr(part, "decide", None), MethodType):
-            decide()  # by its own numbers, as if it had been made of them
+        if isinstance(part, DecidedByRows):
+            part.decide_alone()
     return found
 
 

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from ...lanes import compiled, repeat, where_rows
 from ...lanes.gradients import gradients_of, marked
 from ...lanes.one_thread import small
-from ...lanes.row_decisions import of_first
+from ...lanes.row_decisions import DecidedByRows, of_first
 from ...lanes.row_kinds import kinds_of_rows, of_kinds, whichever
 from ...numerics.checks import fail, one_or_each, positive, positive_real, trailing
 from ...numerics.default_device import beside, device_of
@@ -68,7 +68,7 @@ class Watched(NamedTuple):
     astray: Tensor  # steps in which the barrier's condition was no guide, (B,)
 
 
-class SafetyFilter(Controller):
+class SafetyFilter(Controller, DecidedByRows):
     """The control nearest to what a policy wants that keeps h_i(x, t) >= 0:
 
         min |u - policy(x)|^2 over low <= u <= high with
@@ -214,7 +214,7 @@ class SafetyFilter(Controller):
         made.work = max(float(kind.object.work) for kind in kinds)
         return made
 
-    def decide(self) -> None:
+    def decide_alone(self) -> None:
         """Decide what rows had as numbers of their own, of a copy that has those of one row."""
         of, ahead = self.conditions, self.ahead
         if of.frail is None or ahead.frail is None:
