@@ -32,7 +32,8 @@ from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
 from .lookups import EMPTY, OF_PYTHON, Lookup, attribute_parts, content_of, installed, is_users, lookups
-from .row_numbers import RowNumbers, all_rows
+from .row_numbers import RowNumbers
+from .tensor_writes import Writes
 
 _PACKAGE = __name__.partition(".")[0]
 _VERSIONED = frozenset((_PACKAGE, "torch", "numpy", *OF_PYTHON))  # other processes have the same
@@ -49,7 +50,7 @@ IDLE = _OF_EVERY_MODULE - {*_READ}  # hooks of derivatives and of state_dicts, a
 _log = logging.getLogger(__name__)
 _said: set[tuple[str, str]] = set()  # what has been logged
 _TOLD = "a number of the table"
-_REQUIRES, _VERSION = operator.attrgetter("requires_grad"), operator.attrgetter("_version")
+_REQUIRES = operator.attrgetter("requires_grad")
 _CODE_OF, _CONTENT = operator.attrgetter("__code__", "__defaults__"), operator.attrgetter("cell_contents")
 _BASE, _ARRAY = operator.itemgetter(*_READ), operator.methodcaller("tobytes")
 BOUND = "_compiled_methods"
@@ -59,15 +60,6 @@ _UNREAD, _HOOKS = IDLE | {BOUND}, ("_forward_hooks", "_forward_pre_hooks")
 
 class Derived:
     """Base of what follows from its recipe in a pickle, as programs do: nothing inside of it is watched."""
-
-
-def version(tensor: Tensor) -> int:
-    """Return a number that is another one once the tensor was written to.
-
-    Torch counts writes, but not those to tensors made in inference mode: of these it is the content.
-    """
-    tensor = all_rows(tensor)
-    return hash(tensor.numpy(force=True).tobytes()) if tensor.is_inference() else tensor._version
 
 
 class Contents:
@@ -108,13 +100,8 @@ class Contents:
 
     def _watch(self, walk: Walk) -> None:
         """Note how all that was come upon is now."""
-        found = [*map(all_rows, walk.tensors), *walk.others]
-        self._changeable = [tensor for tensor in found if not tensor.is_inference()]
-        self._structural = [(tensor, tensor._version) for tensor in walk.others if not tensor.is_inference()]
-        self._versions = [tensor._version for tensor in self._changeable]
-        inference = [tensor for tensor in found if tensor.is_inference()]
+        self._writes, self._structural = Writes([*walk.tensors, *walk.others]), Writes(walk.others)
         self._rare: list[tuple[Callable[[Any], Any], Any, Any]] = [
-            *((version, tensor, version(tensor)) for tensor in inference),
             *((set, part, set(part)) for part in walk.sets),
             *((_ARRAY, array, array.tobytes()) for array in walk.arrays),
         ]
@@ -155,7 +142,7 @@ class Contents:
                 # the same objects: nothing else is compared
                 and (not self._modules or [*map(_BASE, self._modules)] == self._bases)
                 and all(map(is_, self._look(), self._inside))
-                and (not self._changeable or [*map(_VERSION, self._changeable)] == self._versions)
+                and self._writes.none()
                 and not (self._rare and any(now(part) != then for now, part, then in self._rare))
                 and not (library and self.replaced(self._methods))
             )
@@ -164,10 +151,10 @@ class Contents:
 
     def renewed(self) -> bool:
         """Return whether floating-point numbers alone have changed; they count from now on."""
-        then, self._versions = self._versions, [tensor._version for tensor in self._changeable]
-        if self.unchanged(library=False) and all(t._version == v for t, v in self._structural):
+        then, self._writes = self._writes, self._writes.again()
+        if self.unchanged(library=False) and self._structural.none():
             return True
-        self._versions = then
+        self._writes = then
         return False
 
     def methods(self) -> list[Any]:

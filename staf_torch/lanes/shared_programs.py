@@ -9,10 +9,11 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from .contents import Contents, version
+from .contents import Contents
 from .locks import Mutex
 from .loops import traced_as
 from .program import Program
+from .tensor_writes import Writes
 from .told_numbers import leads_by_copies, told_copies
 from .trace.step import Step
 
@@ -26,7 +27,7 @@ class _KeptModel(NamedTuple):
     found: list[Tensor]  # by the traced one
     last: Program
     tensors: list[Tensor]  # of the last
-    versions: list[int]
+    writes: Writes  # to them
     signature: bytes | None
     methods: list[Any]  # of the library's classes that the step's objects are of
 
@@ -95,7 +96,7 @@ class SharedPrograms:
             new.described(None, ())
             return new
         tensors = read.tensors
-        versions = [*map(version, tensors)]
+        writes = Writes(tensors)
         floats = read.told
 
         def spelled() -> Step:
@@ -105,13 +106,13 @@ class SharedPrograms:
             return traced_as(lambda *given: make(*told_copies(floats, parts))(*given))(step)
 
         with self._lock:
-            return self._found(spelled, read, versions, copies, owners)
+            return self._found(spelled, read, writes, copies, owners)
 
     def _found(
         self,
         step: Callable[[], Step],
         read: Contents,
-        versions: list[int],
+        writes: Writes,
         copies: int,
         owners: tuple[Any, ...],
     ) -> Program:
@@ -120,11 +121,11 @@ class SharedPrograms:
         if held is None or read.replaced(held.methods):
             new, signature = Program(step(), name=self._name, copies=copies), read.signature()
             new.described(signature, tensors)
-            held = _KeptModel(new, tensors, new, tensors, versions, signature, read.methods())
-        elif held.versions != versions or not all(map(is_, held.tensors, tensors)):
+            held = _KeptModel(new, tensors, new, tensors, writes, signature, read.methods())
+        elif not held.writes.none() or not all(map(is_, held.tensors, tensors)):
             new = held.traced.with_others(step(), list(zip(held.found, tensors, strict=True)))
             new.described(held.signature, tensors)
-            held = held._replace(last=new, tensors=tensors, versions=versions)
+            held = held._replace(last=new, tensors=tensors, writes=writes)
         self._models[read.key] = held
         _forget(self._models, self._most)
         if owners:

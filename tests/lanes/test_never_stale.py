@@ -170,6 +170,22 @@ def test_a_script_is_a_users_under_any_name_and_program_that_runs_it(
         assert of(kept, function)(X, steps=1)[1].requires_grad
 
 
+def test_a_tensor_that_is_given_other_memory_is_read_there() -> None:
+    """Torch counts no write then: `vector_to_parameters` does so, and memory is soon used again."""
+    net, kept = nn.Linear(2, 2, bias=False).double(), SharedPrograms("a test")
+    own = Program(lambda x, _, __: (x, net(x)))
+    for k in range(6):
+        for _ in range(1 + k % 3):
+            nn.utils.vector_to_parameters(torch.randn(4, dtype=torch.float64), net.parameters())
+        for program in (own, of(kept, net)):
+            right(program, net)
+    whole = torch.arange(2)
+    picked = Program(lambda x, _, __: (x, x[:, whole]))
+    for order in ([0, 1], [1, 0]):
+        whole.data = torch.tensor(order)
+        right(picked, lambda x: x[:, whole])
+
+
 def test_closures_of_equal_content_share_a_program_and_others_do_not(notebook: Any) -> None:
     kept = SharedPrograms("a test")
     first = of(kept, notebook.closing(2.0))
