@@ -103,8 +103,8 @@ def installed(module: str) -> bool:
     `python -m cProfile script.py` runs a script in a namespace of this name, and the module is the profiler.
     """
     root = module.partition(".")[0]
-    if root == _PACKAGE or root.startswith("namedtuple_"):
-        return True
+    if root == _PACKAGE or (root.startswith("namedtuple_") and root not in sys.modules):
+        return True  # of a named tuple's own methods
     file = getattr(sys.modules.get(module), "__file__", None)
     if root == "__main__" or file is None:
         return root in OF_PYTHON

@@ -146,7 +146,7 @@ def test_a_function_is_computed_with_what_it_reads_at_the_moment(name: str, note
         right(program, function)
 
 
-@pytest.mark.parametrize("name", ["__main__", "this", None])
+@pytest.mark.parametrize("name", ["__main__", "this", "namedtuple_of_mine", None])
 def test_a_script_is_a_users_under_any_name_and_program_that_runs_it(
     name: str | None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
