@@ -1,11 +1,15 @@
 """The manuals: Python blocks run, and commands of guides; links lead somewhere, what they name exists.
 
-Blocks that are only shown are marked ```py or ```text.
+Blocks that are only shown are marked ```py or ```text. A number that was measured has a unit of time, memory
+or share, is a power of ten, or is an error, cost or ratio with decimals; settings stand in backquotes. Its
+section names the command that gives it, or the page prints it when it runs. Where a part of the benchmarks is
+named beside it (`python -m tests.benchmarks PART`), it is a row of that part, to the digits shown.
 """
 
 from __future__ import annotations
 
 import importlib.util
+import json
 import re
 import shlex
 import shutil
@@ -15,6 +19,7 @@ from pathlib import Path
 
 import guides
 import pytest
+from benchmarks.__main__ import KEPT, PARTS, TABLE, markdown
 from command_line import ROOT
 from composing import settings
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -70,16 +75,21 @@ def asked(path: Path) -> object:
     "path", [asked(p) for p in [README, *MANUALS] if any(guides.blocks(read(p), ("python",)))]
 )
 def test_blocks_of_a_page_run_one_after_another(
-    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    path: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
     if path.parent.name == "deploy" and not compiler.compiler():
         pytest.skip("its C is compiled")
-    if path not in guides.guides():
-        return guides.run_page(read(path), name(path), ("python",))
     if path.stem == "plant_to_c" and not shutil.which("gcc"):
         pytest.skip("its C is compiled")
-    guides.run_page(read(path), name(path))
+    guides.run_page(read(path), name(path), guides.KINDS if path in guides.guides() else ("python",))
+    assert unfounded(read(path), capsys.readouterr().out) == []
+    if path not in guides.guides():
+        return
     assert (tmp_path / f"{path.stem}.png").exists(), "a guide ends with a picture that its reader gets"
     assert f"](pictures/{path.stem}.webp)" in read(path)
     assert "runs in plain torch" not in caplog.text
@@ -176,15 +186,15 @@ def test_files_and_tests_that_pages_name_exist() -> None:
 # --- commands -----------------------------------------------------------------------------------------------
 
 
-def commands(path: Path, program: str) -> list[str]:
+def commands(text: str, program: str) -> list[str]:
     """Command lines of a program: in `code` of the text, and in blocks for the terminal."""
-    text = re.sub(r"\\\n\s*", "", read(path))  # lines that go on
+    text = re.sub(r"\\\n\s*", "", text)  # lines that go on
     blocks = re.findall(r"^```(?:text|bash)?\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
-    inline = re.findall(r"`([^`\n]+)`", without_blocks(text))
+    inline = [" ".join(found.split()) for found in re.findall(r"`([^`]+)`", without_blocks(text))]
     lines = [re.sub(r"(^|\s)#.*", "", line) for block in blocks for line in block.splitlines()]
     lines = [part for line in lines for part in line.split("&&")] + inline
     own = ("--config-dir", "-cd ", "hydra.searchpath")  # settings from a folder of the reader's own
-    start = re.compile(rf"{program} (?!=)")
+    start = re.compile(rf"{program}{'' if program[-1] in './' else ' '}(?!=)")
     return [line.strip() for line in lines if start.match(line.strip()) and not any(o in line for o in own)]
 
 
@@ -220,11 +230,11 @@ def jobs(words: list[str]) -> list[list[str]]:
     return [first, *others]
 
 
-STAF = {command: name(path) for path in [README, *MANUALS] for command in commands(path, "staf")}
+STAF = {command: name(path) for path in [README, *MANUALS] for command in commands(read(path), "staf")}
 
 
 def test_the_front_page_names_commands() -> None:
-    assert len(commands(README, "staf")) >= 8
+    assert len(commands(read(README), "staf")) >= 8
 
 
 @pytest.mark.parametrize(
@@ -246,8 +256,118 @@ def test_options_of_the_other_programs_exist(
     with pytest.raises(SystemExit):
         main(["--help"])
     known = set(re.findall(r"--[\w-]+", capsys.readouterr().out))
-    lines = [(path, line) for path in [README, *MANUALS] for line in commands(path, program)]
+    lines = [(path, line) for path in [README, *MANUALS] for line in commands(read(path), program)]
     assert lines
     for path, line in lines:
         used = {word for word in line.split() if word.startswith("--")}
         assert used <= known, f"{name(path)}: {line}"
+
+
+# --- numbers ------------------------------------------------------------------------------------------------
+
+FIGURE = r"(?<![\w.^/-])-?(?:\d+(?:\.\d+)?|\.\d+)(?:e[-+]?\d+)?"
+UNIT = re.compile(
+    rf"({FIGURE})(?:\s*%(?!\s(?:interval|band))|\s(?:us|µs|microseconds|ms|s|CPU-s|[KMG]i?B|G|times\sas)(?!\w))"
+)
+POWER = re.compile(r"(?<![\w.^])\d+(?:\.\d+)?e[-+]?\d+")
+JUDGED = re.compile(r"\b(?:errors?|excess|costs?|rms|return|ratio|optimum)\b")
+CELL = re.compile(r"(?<=\|) *\**(\d*\.\d+(?:e[-+]?\d+)?)\** *(?=\|)")
+PROGRAMS = ("staf", "staf-table", "staf-export", "python tests/", "python -m tests.", "pytest")
+
+
+def measured(text: str) -> list[str]:
+    """Numbers of a paragraph or table that were measured."""
+    text = re.sub(r"\]\([^)]*\)|`[^`]*`|\$[^$]*\$|^!\[.*$|^#.*$", "]", text, flags=re.MULTILINE)
+    found = UNIT.findall(text) + POWER.findall(text) + CELL.findall(text)
+    for sentence in re.split(r"(?<=[.;:?])\s|\|", text):
+        if JUDGED.search(sentence):
+            found += [each for each in re.findall(FIGURE, sentence) if "." in each]
+    return list(dict.fromkeys(found))
+
+
+def figures(text: str) -> list[float]:
+    return [float(each) for each in re.findall(FIGURE, text)]
+
+
+def stands_in(shown: str, values: list[float]) -> bool:
+    """Whether one of the values is the number, to the digits shown and but for its sign."""
+    digits, _, power = shown.lstrip("-").partition("e")
+    whole, _, part = digits.partition(".")
+    last = len(whole) - len(whole.rstrip("0")) if not part and float(digits) else -len(part)
+    half = 0.5000001 * 10.0 ** (last + int(power or 0))
+    return any(abs(abs(value) - abs(float(shown))) <= half for value in values)
+
+
+def sections(text: str) -> list[str]:
+    marked = re.sub(r"^```.*?^```$", lambda block: block[0].replace("\n#", "\n\0#"), text, flags=re.S | re.M)
+    return [part.replace("\0", "") for part in re.split(r"^(?=#+ )", marked, flags=re.MULTILINE)]
+
+
+def rows(parts: list[str]) -> list[float]:
+    """Numbers of parts of the benchmarks page; times also in ms, shares in %."""
+    kept = json.loads(read(KEPT))
+    claims = [(claim, float(value)) for part in parts for claim, value in kept[part]["numbers"].items()]
+    scale = {"us": 1e-3, "share": 100}
+    return [
+        value * each
+        for claim, value in claims
+        for each in (1, *(scale[word] for word in re.findall(r"\w+", claim) if word in scale))
+    ]
+
+
+def unfounded(text: str, printed: str = "") -> list[str]:
+    """Measured numbers of a page that neither a command of their section nor what the page prints gives."""
+    found, given = [], figures(printed)
+    for section in sections(text):
+        lines = [line for program in PROGRAMS for line in commands(section, program)]
+        named = any(not line.startswith("python -m tests.benchmarks") for line in lines)
+        for block in re.split(r"\n\s*\n", without_blocks(section)):
+            lines = commands(block, "python -m tests.benchmarks")
+            parts = [word for line in lines for word in line.split() if word in PARTS]
+            if parts or not named:
+                values = rows(parts) if parts else given
+                found += [each for each in measured(block) if not stands_in(each, values)]
+    return found
+
+
+@pytest.mark.parametrize(
+    "path",
+    [p for p in [README, *MANUALS] if p != TABLE and not any(guides.blocks(read(p), ("python",)))],
+    ids=name,
+)
+def test_a_command_gives_what_was_measured(path: Path) -> None:
+    """Pages with Python are asked where they run, as they may print it."""
+    assert unfounded(read(path)) == []
+
+
+def test_front_page_claims_rows_of_the_benchmarks() -> None:
+    """Each number of a claim stands in the rows of its command, and every other one in a row."""
+    table = [
+        (about["command"], f"{claim} {value}")
+        for about in json.loads(read(KEPT)).values()
+        for claim, value in about["numbers"].items()
+    ]
+    claims = re.findall(r"^\|([^|]*)\|([^|]*)\| `([^`]*)` \|$", read(README), re.MULTILINE)
+    assert len(claims) >= 8
+    for claim, number, command in claims:
+        values = figures(" ".join(row for whole, row in table if whole.startswith(command)))
+        assert [each for each in re.findall(FIGURE, claim + number) if not stands_in(each, values)] == []
+    values = figures(" ".join(row for _, row in table))
+    assert [each for each in measured(without_blocks(read(README))) if not stands_in(each, values)] == []
+
+
+def test_table_of_the_benchmarks_is_that_of_its_parts() -> None:
+    kept = json.loads(read(KEPT))
+    assert read(TABLE) == markdown(kept)
+    for part, about in kept.items():
+        assert about["command"] == PARTS[part].command
+        assert set(about["numbers"]) <= set(PARTS[part].claims), part
+
+
+def test_options_of_the_benchmarks_exist() -> None:
+    lines = [line for path in (README, *MANUALS) for line in commands(read(path), "python tests/")]
+    assert len(lines) >= 20
+    for line in lines:
+        file = re.findall(r"tests/[\w/]+\.py", line)[0]
+        options = re.findall(r"--[\w-]+", line)
+        assert [each for each in options if f'"{each}"' not in read(ROOT / file)] == [], line

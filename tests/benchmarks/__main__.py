@@ -79,7 +79,10 @@ PARTS = {
     "far": Part(
         "staf experiment=ablation kernel=exponential,gaussian 'initial_state=[20.0,0.0]' centers.radius=0.1 "
         "centers.count=6 seed=0",
-        {f"error on the ball at |x| = 20, {kernel}": rf"\| +{kernel} +\| +\**{NUMBER}" for kernel in KERNELS},
+        {
+            f"error on the ball, x of size 20, {kernel}": rf"\| +{kernel} +\| +\**{NUMBER}"
+            for kernel in KERNELS
+        },
         1,
     ),
     "chase": Part(
@@ -127,7 +130,7 @@ PARTS = {
         "staf experiment=adp_comparison",
         {
             "rollout policy: mean cost over the optimum": "rollout_policy_ratio_mean",
-            "rollout policy: share regulated": "rollout_policy_regulated",
+            "rollout policy: share of 200 states regulated": "rollout_policy_regulated",
             "rollout policy: median cost over the optimum": "rollout_policy_ratio_median",
             "the law as published: share regulated": "staf_as_published_1_ms_regulated",
             "the law as published: median cost over the optimum": "staf_as_published_1_ms_ratio_median",
@@ -286,7 +289,7 @@ PARTS = {
     "device": Part(
         "python -m tests.gpu",
         {
-            "chase_weights, M = 3, 1e6 rows, float64, G trajectory-steps/s": CARD.format("float64"),
+            "chase_weights, M = 3, 1e6 rows x 100 times, float64, G steps/s": CARD.format("float64"),
             "the same, float32": CARD.format("float32"),
             "over JAX with components apart, float64": PEER.format("float64"),
         },
