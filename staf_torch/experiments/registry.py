@@ -19,6 +19,7 @@ Derive a class from `BatchedExperiment` where many jobs can be computed as one t
 
 from __future__ import annotations
 
+import functools
 import importlib
 import math
 from abc import ABC, abstractmethod
@@ -83,6 +84,12 @@ class Solution(Protocol):
 S = TypeVar("S", bound=Solution)
 
 
+@functools.lru_cache(4096)  # a sweep asks for each setting of each job
+def _with_groups(name: str) -> tuple[str, ...]:
+    """A dotted name, and ``group.*`` for every group that it is in."""
+    return name, *(f"{name[:i]}.*" for i, letter in enumerate(name) if letter == ".")
+
+
 def _form(value: object) -> object:
     """Return the word "number" for a number, lists entry by entry, anything else itself in a list."""
     if isinstance(value, list):
@@ -120,8 +127,7 @@ class BatchedExperiment(ABC, Generic[S]):
 
     def shared(self, name: str, value: object) -> object:
         """Return what a batch shares of a setting: nothing of a batchable number, else all (JSON)."""
-        groups = {f"{name[:i]}.*" for i, letter in enumerate(name) if letter == "."}
-        return value if self.batchable.isdisjoint({name, *groups}) else _form(value)
+        return value if self.batchable.isdisjoint(_with_groups(name)) else _form(value)
 
     def shape(self, settings: Mapping[str, object]) -> object:
         """Return what follows from batchable settings and must be equal in a batch all the same (JSON)."""

@@ -169,14 +169,14 @@ def test_a_job_in_a_compiled_batch_is_as_close_to_the_truth_as_alone() -> None:
             assert errors[0] <= 4 * errors[1] + 1e-13 * size
 
 
-MIXED = ["centers.count=3,6", "centers.radius=0.05,-1,0.2", "kernel=gaussian,polynomial", "seed=1,2"]
+MIXED = ["centers.count=3,6", "centers.radius=0.05,-1,0.2", "kernel=gaussian,polynomial"]
 
 
 def test_a_sweep_of_numbers_and_counts_is_one_call_for_each_count(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.DEBUG, "staf_torch")
     cfgs = compose([], MIXED)
     chosen = groups(cfgs)
-    assert [len(group) for group in chosen] == [6, 6, 6, 6]
+    assert [len(group) for group in chosen] == [3, 3, 3, 3]
     found = {
         k: one for group in chosen for k, one in zip(group, solve([cfgs[k] for k in group]), strict=True)
     }
@@ -187,18 +187,17 @@ def test_a_sweep_of_numbers_and_counts_is_one_call_for_each_count(caplog: pytest
             continue
         outcome = found[k]
         assert isinstance(outcome, Computed)
-        if k % 2 == 0:  # alone
-            (alone,) = solutions([cfg])
-            assert outcome.metrics == pytest.approx(alone.metrics, rel=1e-9, abs=1e-10)
+        (alone,) = solutions([cfg])
+        assert outcome.metrics == pytest.approx(alone.metrics, rel=1e-9, abs=1e-10)
 
 
 CLOSED = ("dt=0.005", "duration=0.1", "adp.compile=false", "figures=false")
 SHORT_LOOP = ("adp.optimum.shooting=false", "initial_state=[0.5,0.0]")
 LOOPS = {
-    "information": ([], ["seed=0,1", "adp.critic=0.4,0.8", "adp.gains.actor=1.2,2.0"]),
+    "information": ([], ["adp.critic=0.4,0.8", "adp.gains.actor=1.2,2.0"]),
     "published": (
         ["adp/law=published", "trajectories=2", "adp.gain=250"],
-        ["adp.gains.critic_extrapolated=0.25,0.1", "adp.gains.forgetting=0.003,0.01"],
+        ["adp.gains.critic_extrapolated=0.25,0.1"],
     ),
     "supervised": (
         ["adp.trust=0.5", "duration=0.5", "dt=0.01"],
@@ -216,9 +215,9 @@ LOOPS = {
     "bases": ([], ["centers.shrink.gain=1,1.5", "adp.half_width=0.5,0.6"]),
     "behind walls": (
         ["adp/policy=lqr", "system=pendulum", "adp.walls.high=[1.0,null]", "duration=0.03", *SHORT_LOOP],
-        ["system.mass=0.5,2", "seed=0,1"],
+        ["system.mass=0.5,2"],
     ),
-    "single precision": (["dtype=float32"], ["adp.gains.information=1,2", "seed=0,1"]),
+    "single precision": (["dtype=float32"], ["adp.gains.information=1,2"]),
 }
 
 
@@ -278,7 +277,7 @@ def test_a_member_that_is_refused_fails_alone_with_its_own_sentence() -> None:
 
 
 def test_a_member_that_diverges_leaves_the_others_as_they_are() -> None:
-    cfgs = compose(["system=van_der_pol", "dt=0.2", "duration=20"], ["initial_state=[1.0,0.0],[90.0,90.0]"])
+    cfgs = compose(["system=van_der_pol", "dt=0.2", "duration=4"], ["initial_state=[1.0,0.0],[90.0,90.0]"])
     (kept, lost), (alone,) = solutions(cfgs), solutions(cfgs[:1])
     assert lost.metrics["diverged_fraction"] == 1
     assert lost.metrics["ultimate_error"] is None

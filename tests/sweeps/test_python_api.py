@@ -93,8 +93,9 @@ def test_a_run_leaves_what_the_command_leaves(
     (figure,) = found.figures().values()
     assert isinstance(figure, Figure)
     assert len(repr(found)) < 120
-    assert "data:image/png;base64," in notebook(found)
-    assert "<th>ball_error</th>" in notebook(found)
+    shown = notebook(found)
+    assert "data:image/png;base64," in shown
+    assert "<th>ball_error</th>" in shown
 
 
 @pytest.mark.usefixtures("_untouched")
@@ -241,8 +242,8 @@ def test_own_function_to_figure_in_six_lines_of_a_notebook() -> None:
 
 def test_memory_is_flat_over_sweeps() -> None:
     counts = []
-    for _ in range(4):
+    for _ in range(3):
         staf_torch.sweep("seed=range(2)", "trajectories=2", *BARE)
         gc.collect()
         counts.append(len(gc.get_objects()))
-    assert counts[3] < 1.01 * counts[2] + 100  # Python 3.13 names its youngest objects alone
+    assert counts[2] < 1.01 * counts[1] + 100  # Python 3.13 names its youngest objects alone
