@@ -37,7 +37,8 @@ os.environ["CXXFLAGS"] = f"{OWN} {QUICK}"
 OPTIMISED = {"engine", "lanes", "online"}
 AS_FOR_USERS = (
     *("have_the_same_bits", "has_the_same_bits", "the_bits_that", "change_bits", "continue_to_the_bit"),
-    *("test_compiled_is_the_definition", "compiled_filter_is_its", "within_their_bounds"),
+    *("test_compiled_is_the_definition", "within_their_bounds"),
+    *("compiled_filter_is_its_definition[inf-False", "compiled_filter_is_its_definition[2.0-False"),
 )
 """Tests of those rooms, by parts of their names, whose programs are built as users have them: bits of rows
 beside others or rounding are the matter. A filter of streams then takes 8 s to build, and 1 s otherwise."""
@@ -137,8 +138,6 @@ def _alike_in_every_order(
     room = request.path.relative_to(TESTS).parts[0]
     if room in OPTIMISED and any(words in request.node.name for words in AS_FOR_USERS):
         monkeypatch.setenv("CXXFLAGS", OWN)
-    elif "stream_with_bands" in request.node.name:  # a mixture learns thousands of samples
-        monkeypatch.setenv("CXXFLAGS", f"{OWN} {QUICK[:-1]}1")
     if room in ("adp", "deploy") and quick_cc is not None:
         monkeypatch.setenv("CC", str(quick_cc))
     compiled = room in COMPILED or request.node.get_closest_marker("compiled") is not None

@@ -57,7 +57,7 @@ def states(count: int) -> Tensor:
 def test_memory_in_c_has_the_control_of_the_library_and_says_what_a_call_takes(
     memory: adp.GlobalValue, tmp_path: Path
 ) -> None:
-    x, path = states(200), tmp_path / "memory.h"
+    x, path = states(80), tmp_path / "memory.h"
     policy = deploy.policy_of(memory)
     source = deploy.export_c(policy, x, path, ["u"])
     (u,) = runner_c(path, [1], torch.float64)(x)
@@ -76,13 +76,13 @@ def test_memory_in_c_has_the_control_of_the_library_and_says_what_a_call_takes(
     (follows,) = re.findall(r"void remembered_follow\(([^)]*)\)", path.read_text())
     assert re.findall(r"\w+(?=\[|,|$)", follows)[-2:] == ["cost", "control"], follows
     timed = deploy.time_c(path, x, [1])
-    assert timed.calls == 200
+    assert timed.calls == 80
     assert 0 < timed.median_us <= timed.p99_us <= timed.worst_us
 
 
 @needs_cc
 def test_memory_in_float_chooses_nearly_the_same_control(memory: adp.GlobalValue, tmp_path: Path) -> None:
-    x, path = states(200).float(), tmp_path / "memory.h"
+    x, path = states(80).float(), tmp_path / "memory.h"
     deploy.export_c(deploy.policy_of(memory, dtype=torch.float32), x, path, ["u"])
     (u,) = runner_c(path, [1], torch.float32)(x)
     assert float((u.double() - memory(x.double())).abs().median()) < 1e-4
@@ -115,8 +115,8 @@ def test_plan_that_is_carried_is_a_structure_in_c(kind: str, tmp_path: Path) -> 
     path = tmp_path / "plan.h"
     deploy.export_learning_c(controller, x0, path, dt=0.1)
     generator = torch.Generator().manual_seed(0)
-    x = x0 * torch.linspace(1, 0.1, 20, dtype=torch.float64).unsqueeze(1)  # 8 steps beyond the plan
-    uniform = 2 * torch.rand(20, controller.draws, 2, dtype=torch.float64, generator=generator) - 1
+    x = x0 * torch.linspace(1, 0.1, 16, dtype=torch.float64).unsqueeze(1)  # 4 steps beyond the plan
+    uniform = 2 * torch.rand(16, controller.draws, 2, dtype=torch.float64, generator=generator) - 1
     carried, wanted = controller.init(x0), []
     for at, numbers in zip(x.split(1), uniform.split(1), strict=True):
         u, carried = controller.step(at, carried, numbers, 0.1)

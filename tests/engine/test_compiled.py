@@ -168,11 +168,9 @@ def test_pieces_of_time_continue_to_the_bit_and_remember_who_diverged(compiled: 
     torch.testing.assert_close(last.weights[:, 0], whole.weights[:, -1], rtol=1e-14, atol=0)
 
 
-@pytest.mark.parametrize("predictor", [None, predictors.Secant(guarded=True)])
-def test_pieces_of_all_results_are_the_whole_with_any_predictor(
-    predictor: predictors.Predictor | None, compiled: Callable[..., Any]
-) -> None:
+def test_pieces_of_all_results_are_the_whole(compiled: Callable[..., Any]) -> None:
     """With a predictor, a certificate and a warning that remember the piece before."""
+    predictor = predictors.Secant(guarded=True)
     states, options = 0.5 * circles(2, 12), {"predictor": predictor, "certificate": True, "inner_steps": 2}
     states[1, 5] *= 6.0  # beyond |x| r = 1 by a state of the second piece
     pieces = lambda *given: concatenate(list(chase_pieces(*given, **options)))  # noqa: E731
@@ -235,8 +233,7 @@ class Scaled(Paper):
         return value
 
 
-@pytest.mark.parametrize("run", [chase, chase_weights])
-@pytest.mark.parametrize("kind", [nn.Parameter, Tensor.requires_grad_])
+@pytest.mark.parametrize(("run", "kind"), [(chase, nn.Parameter), (chase_weights, Tensor.requires_grad_)])
 def test_a_learned_target_keeps_its_gradient(run, kind) -> None:
     factor = kind(torch.tensor(2.0, dtype=torch.float64))
     result = run(STATES, GAUSS, Scaled(factor), LAW, inner_steps=2)

@@ -52,7 +52,7 @@ def test_weights_are_a_partition_of_unity() -> None:
 
 def test_blend_is_smooth() -> None:
     memory = filled(st.ExperienceMemory(basis_of("gaussian", radius=0.1), 30), circle(30))
-    y = 1.03 * circle(7)
+    y = 1.03 * circle(3)
     assert torch.autograd.gradcheck(memory.query, (y.requires_grad_(),), atol=1e-5)
     line = torch.linspace(0.05, 0.27, 2201, dtype=torch.float64)  # from one model to the next
     path = torch.stack((line.cos(), line.sin()), dim=-1)

@@ -73,7 +73,7 @@ def test_stream_that_moves_away_for_good_starts_afresh_there(kind: str) -> None:
     assert error_after(model, x, y) < 0.3
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(some.lists(some.tuples(MAGNITUDES, MAGNITUDES, MAGNITUDES), min_size=1, max_size=25), some.booleans())
 def test_filter_is_alive_after_anything(samples: list[tuple[float, float, float]], single: bool) -> None:
     dtype = torch.float32 if single else torch.float64
@@ -88,7 +88,7 @@ def test_filter_is_alive_after_anything(samples: list[tuple[float, float, float]
     assert error_after(model, x, y) < 0.3
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(some.lists(some.tuples(MAGNITUDES, MAGNITUDES, MAGNITUDES), min_size=1, max_size=25))
 def test_bank_is_alive_after_anything(samples: list[tuple[float, float, float]]) -> None:
     model = mixture()
@@ -96,7 +96,7 @@ def test_bank_is_alive_after_anything(samples: list[tuple[float, float, float]])
         model.partial_fit(
             torch.tensor([first, second], dtype=torch.float64), torch.tensor(value, dtype=torch.float64)
         )
-    x, y = path(80)
+    x, y = path(40)
     for state, value in zip(x, y, strict=True):
         model.partial_fit(state, value)
         assert torch.isfinite(model.predict(state))

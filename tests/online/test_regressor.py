@@ -226,7 +226,7 @@ def test_skipped_sample_leaves_the_stream_as_it_was() -> None:
 
 def test_nothing_winds_up_in_a_stream_that_stands_still() -> None:
     model = st.StaFRegressor(radius=0.3, forgetting=0.9)
-    for k in range(1500):
+    for k in range(600):
         model.partial_fit(tensor([0.3, 0.1]), tensor(1.0 + 0.01 * (-1) ** k))
     mean, deviation = model.predict(tensor([0.3, 0.1]), return_std=True)
     assert abs(float(mean) - 1) < 0.02

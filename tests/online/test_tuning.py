@@ -46,7 +46,7 @@ def test_tuned_regressor_predicts_as_one_that_knows_what_the_stream_was_drawn_wi
 
 
 def test_each_coordinate_and_each_stream_has_its_own_width() -> None:
-    along = [drawn(torch.tensor(w).double(), 0.05) for w in ([0.5, 50.0], [50.0, 0.5])]
+    along = [drawn(torch.tensor(w).double(), 0.05, steps=120) for w in ([0.5, 50.0], [50.0, 0.5])]
     x, y = (torch.stack([pair[k] for pair in along], 1) for k in range(2))
     found = st.StaFRegressor().tune(x, y).tuning
     assert found is not None
@@ -90,7 +90,7 @@ def test_tuning_knows_no_units_and_is_saved_with_what_was_learned() -> None:
 
 @pytest.mark.needs_compiler
 def test_the_gradient_finds_what_is_at_least_as_likely_as_the_best_of_the_search() -> None:
-    pairs = [drawn(torch.tensor([0.7, 0.7]).double(), 0.1, steps=120, seed=seed) for seed in range(2)]
+    pairs = [drawn(torch.tensor([0.7, 0.7]).double(), 0.1, steps=60, seed=seed) for seed in range(2)]
     x, y = torch.stack([path[:, :1] for path, _ in pairs], 1), torch.stack([told for _, told in pairs], 1)
     found = [st.StaFRegressor(count=2).tune(x, y, method=how).tuning for how in ("search", "gradient")]
     assert all(each is not None for each in found)
