@@ -85,11 +85,12 @@ class Step:
         warns = self.warns and structure.log_gain is not None
         reach = torch.maximum(carry.reach, self._reach(x)) if warns else carry.reach
         lost = now.diverged_at >= 0
-        # Not of now.log_gain: what follows from x_k alone is found for many times at once.
-        unit = torch.where(lost & ~begins, carry.unit, (-known.log_gain).exp())
-        kept = RowCarry(now, reach, unit)
-        if structure.log_gain is None:
+        unit = (-known.log_gain).exp()  # not of now.log_gain: of x_k alone, for many times at once
+        if structure.log_gain is None:  # 1 at all times: the results are the weights that are carried on
             kept = RowCarry(now._replace(log_gain=carry.chase.log_gain), reach, carry.unit)
+        else:
+            unit = torch.where(lost & ~begins, carry.unit, unit)
+            kept = RowCarry(now, reach, unit)
         if not self.everything:
             return kept, Outputs(weights=now.weights * unit.unsqueeze(-1))
         run = Corrected(before, now.weights, known.values, known.log_gain)

@@ -1,7 +1,8 @@
 """Gradients of a row program: forward compiled, backward by a second program, the adjoint of the step.
 
-Where steps are long, the forward pass keeps the carry before every one of them; where they are short, and
-memory is slower than arithmetic, the backward pass computes it again (`backward`).
+The adjoint reads the carry before every step where results have it. Of what they have not, the forward pass
+keeps it where steps are long; where they are short, and memory is slower than arithmetic, the backward pass
+computes it again (`backward`). Where nobody asks for a gradient, nothing is kept.
 """
 
 from __future__ import annotations
@@ -21,9 +22,10 @@ from .call import Compiled, PlannedCall, Where, served
 from .call_inputs import Given
 from .device.kernel import DeviceCall
 from .growth import Slope, grown, say_grown
+from .kept import Keeping, Watched, in_results, unchanged
 from .log import say
 from .row_numbers import RowNumbers, columns
-from .row_sums import empty_rows, split
+from .row_sums import split
 from .tree import Shared, flatten, labels, plain, unflatten
 
 if TYPE_CHECKING:
@@ -32,6 +34,7 @@ if TYPE_CHECKING:
 
 _WORTH = 10  # operations of a step for each byte of its carry: kept, it costs less than the step again
 Plan = PlannedCall | DeviceCall
+_PATIENCE = 8  # calls that write carries for a gradient for which nobody asks, before others do without
 _PLANS = 64  # calls of other shapes that are remembered
 _MEBIBYTE = 2**20
 _budget = 256 * _MEBIBYTE
@@ -82,8 +85,8 @@ class Ran(NamedTuple):
         read: all that the trace found.
         numbers: of rows that the step reads.
         versions: of what the step reads and has no gradient.
-        kept: whether the forward pass keeps the carries.
-        keeps: leaves of the carry of which it does.
+        keeps: leaves of the carry that are kept, or that results have; None where nothing is kept.
+        written: those of them that no result has; None where nobody asks for a gradient.
         budget: bytes.
     """
 
@@ -96,8 +99,8 @@ class Ran(NamedTuple):
     read: tuple[Tensor, ...]
     numbers: tuple[RowNumbers, ...]
     versions: tuple[tuple[Tensor, int], ...]
-    kept: bool
-    keeps: frozenset[int]
+    keeps: frozenset[int] | None
+    written: frozenset[int] | None
     budget: int
 
 
@@ -122,7 +125,8 @@ class GradientCall:
         self._plans: dict[Any, tuple[Compiled, Plan]] = {}
         self.followers: dict[Hashable, tuple[Program, tuple[Hashable, Any], Any]] = {}
         self._keepers: dict[Where, tuple[Program, Hashable]] = {}  # programs, and where what is built stands
-        self._refused = False
+        self._keepings: dict[Hashable, Keeping] = {}
+        self._refused, self._unasked = False, 0  # calls since a gradient was asked for
         self.adjoints = program.adjoints
 
     def __call__(self, leaves: Sequence[Any]) -> tuple[Any, Any] | None:
@@ -158,8 +162,7 @@ class GradientCall:
         read = [keeping.in_place_of(tensor) for tensor in built.trace.recipe.found]
         found = tuple(k for k, tensor in enumerate(read) if tensor.requires_grad)
         fixed = [t for t in read if not (t.requires_grad or t.is_inference())]
-        size, work = carried(built.compiled), _work(built.trace.text.source)
-        pays = work is None or work > _WORTH * size
+        keeps, written = self._keeps(where, built)
         return Ran(
             call=self,
             where=where,
@@ -170,10 +173,28 @@ class GradientCall:
             read=tuple(read),
             numbers=built.compiled.rows,
             versions=tuple((tensor, tensor._version) for tensor in fixed),
-            kept=pays and self.every == 1 and size * self.rows * self.times <= _budget,
-            keeps=frozenset(self.needed(built.trace) or range(self.sizes[2])),
+            keeps=keeps,
+            written=written,
             budget=_budget,
         )
+
+    def _keeps(self, where: Where, built: Built) -> tuple[frozenset[int] | None, frozenset[int] | None]:
+        """Return `Ran.keeps` and `Ran.written`."""
+        compiled, trace, needed = built.compiled, built.trace, frozenset(range(self.sizes[2]))
+        known: Any = self.adjoints.get(id(trace))
+        there = frozenset[int]()
+        if where is True:
+            needed = needed if known is None else frozenset(known[1])
+            there = needed & in_results(trace, len(compiled.outputs) - self.sizes[2])
+        written = needed - there
+        size = sum(compiled.carry[k][0].numel() for k in written) * compiled.real.itemsize
+        work = _work(trace.text.source)
+        pays = work is None or work > _WORTH * size
+        if self.every > 1 or not pays or size * self.rows * self.times > _budget:
+            return None, None
+        if where is True and (known is None or (written and self._unasked >= _PATIENCE)):
+            return there, None
+        return needed, written
 
     def given(self, tensors: Sequence[Tensor]) -> Given:
         """Return the inputs of the program, of flat ones."""
@@ -256,33 +277,29 @@ class GradientCall:
             self._plans[key] = built.compiled, plan
         return plan, leaves
 
-    def forward(self, ran: Ran, tensors: Sequence[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
-        """Return the carry with the outputs, and the carries that are kept."""
+    def forward(
+        self, ran: Ran, tensors: Sequence[Tensor]
+    ) -> tuple[list[Tensor], list[Tensor], list[Watched]]:
+        """Return the carry with the outputs, the carries that are kept, and what of them results have."""
         given = self.given(tensors[: sum(self.sizes)])
         own = tensors[len(tensors) - len(ran.numbers) :]
-        fewer = None if ran.kept else self.program.built(given)
-        end = len(ran.built.compiled.outputs)  # carries and outputs, before the carries that are kept
-        if ran.kept and ran.where is True:
-            return self._keeping(ran, given, own)
-        rooms = self.run(ran.where, fewer or ran.built, given, own, self.every)
-        if fewer is not None:
-            return rooms, []
-        return rooms[:end], rooms[end:] if ran.kept else []
-
-    def _keeping(self, ran: Ran, given: Given, own: Sequence[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
-        """The results, and the carry before every time of those leaves that the adjoint reads."""
-        compiled, (rows, times) = ran.built.compiled, (self.rows, self.times)
-        like, end = torch.empty(0, dtype=compiled.real, device="cpu"), len(compiled.outputs)
-        made = compiled.outputs[: end - self.sizes[2]]
-        results = [empty_rows(like, rows, (), shape) for shape, _ in compiled.carry]
-        results += [empty_rows(like, rows, (times,), shape) for shape, _ in made]
-        kept = [
-            empty_rows(like, rows, (times if k in ran.keeps else 1,), shape).expand(rows, times, *shape)
-            for k, (shape, _) in enumerate(compiled.carry)
-        ]
-        self.run(True, ran.built, given, own, 1, rooms=[*results, *kept])
-        dtypes = [dtype for _, dtype in (*compiled.carry, *made)]
-        return [room.to(dtype) for room, dtype in zip(results, dtypes, strict=True)], kept
+        self._unasked += 1
+        keeping, end = ran.built, len(ran.built.compiled.outputs)  # carries and outputs, before carries
+        nothing = ran.keeps is None or (ran.written is not None and not ran.written)
+        built = (self.program.built(given) if nothing else None) or keeping
+        if ran.keeps is None or ran.where is not True:
+            rooms = self.run(ran.where, built, given, own, self.every)
+            return rooms[:end], [] if ran.keeps is None else rooms[end:], []
+        compiled, results = built.compiled, end - self.sizes[2]
+        key = id(keeping.trace), nothing, ran.keeps
+        if key not in self._keepings:
+            sizes = self.rows, self.times
+            self._keepings[key] = Keeping(compiled, keeping.trace, ran.keeps, results, sizes)
+        made = self._keepings[key](given.carry)
+        self.run(True, built, given, own, 1, rooms=made.all)
+        dtypes = [dtype for _, dtype in (*compiled.carry, *compiled.outputs)]
+        found = [room.to(dtype) for room, dtype in zip(made.results, dtypes, strict=False)]
+        return found, made.before, made.watched
 
     def backward(
         self,
@@ -293,6 +310,7 @@ class GradientCall:
         ends: Sequence[Tensor | None],
     ) -> list[Tensor | None]:
         """Return the gradients by the inputs, the captured tensors and the numbers of rows."""
+        self._unasked = 0
         if any(tensor._version != version for tensor, version in ran.versions):
             raise RuntimeError(
                 f"a tensor that {self.program.name} reads was modified by an inplace operation before the "
@@ -364,7 +382,7 @@ class _Gradient(torch.autograd.Function):
     def forward(ctx: Any, ran: Ran, *tensors: Tensor) -> tuple[Tensor, ...]:
         ctx.ran = ran
         ctx.set_materialize_grads(False)
-        rooms, kept = ran.call.forward(ran, [tensor.detach() for tensor in tensors])
+        rooms, kept, ctx.watched = ran.call.forward(ran, [tensor.detach() for tensor in tensors])
         ctx.save_for_backward(*tensors, *kept)
         ctx.mark_non_differentiable(*[room for room in rooms if not room.is_floating_point()])
         return tuple(rooms)
@@ -375,7 +393,8 @@ class _Gradient(torch.autograd.Function):
         if all(end is None for end in ends):
             return (None,) * (1 + len(needs))
         count = len(needs)
-        return None, *ctx.ran.call.backward(ctx.ran, saved[:count], saved[count:], needs, ends)
+        kept = saved[count:] if unchanged(ctx.watched) else []
+        return None, *ctx.ran.call.backward(ctx.ran, saved[:count], kept, needs, ends)
 
 
 @functools.lru_cache(_PLANS)
@@ -383,8 +402,3 @@ def _work(source: str) -> int | None:
     """Return the operations of a step that a text tells; None for a kernel."""
     found = re.search(r"WORK_STEP = (\d+)", source)
     return None if found is None else int(found[1])
-
-
-def carried(compiled: Compiled) -> int:
-    """Return the bytes of the carry of a row."""
-    return sum(shape.numel() for shape, _ in compiled.carry) * compiled.real.itemsize

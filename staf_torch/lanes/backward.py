@@ -210,7 +210,7 @@ class Backward:
         Args:
             kept: the carry before every time, if the forward pass has kept it.
         """
-        if not self._needed.issubset(self._ran.keeps):
+        if not self._needed.issubset(self._ran.keeps or ()):
             kept = []
         call, (rows, times) = self._call, self._blocks(bool(kept))
         slopes, sums = list[list[Tensor]](), list[list[Tensor]]()

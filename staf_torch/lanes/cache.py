@@ -80,6 +80,7 @@ class Trace(NamedTuple):
     structure: Any
     rows: tuple[RowNumbers, ...]
     times: tuple[int, ...]  # inputs of a time that anything depends on
+    carried: tuple[tuple[str, int], ...]  # of every leaf of the carry: where else its numbers are
 
 
 def place(*described: object) -> Path:

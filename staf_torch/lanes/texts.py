@@ -19,6 +19,7 @@ from .emit.cpp import emit
 from .emit.cuda import Dtypes, emit_cuda
 from .emit.tables import Text
 from .row_numbers import RowNumbers
+from .trace.kept_carries import carried
 from .trace.step import Step, Traced, trace
 from .trace.tracer import NotLoweredError
 from .tree import plain
@@ -117,8 +118,8 @@ def _traced(step: Step, given: Given, *, widened: bool = False) -> Traced:
 
 def _record(text: Text, traced: Traced, real: torch.dtype) -> Trace:
     graph, _, following, outputs = traced.program
-    times = graph.slots("now", [*following, *outputs])
-    return Trace(text, traced.recipe, real, traced.outputs, traced.structure, traced.rows, times)
+    times, where = graph.slots("now", [*following, *outputs]), carried(*traced.program)
+    return Trace(text, traced.recipe, real, traced.outputs, traced.structure, traced.rows, times, where)
 
 
 def kernel(traced: Traced, given: Given) -> Text:

@@ -140,6 +140,43 @@ def test_where_nobody_asks_for_it_there_is_none_and_a_checkpoint_has_it() -> Non
     torch.testing.assert_close(found, torch.autograd.grad(EVERYTHING(*given)[0][0].sum(), x)[0])
 
 
+def _doubled(result: Tensor) -> None:
+    result.mul_(2)
+
+
+def _set_behind_autograd(result: Tensor) -> None:
+    result.detach()[:, 1] = 3
+
+
+@pytest.mark.parametrize("write", [None, _doubled, _set_behind_autograd])
+@pytest.mark.parametrize("after", [False, True])
+def test_a_result_that_is_the_carry_may_be_written_over_before_the_backward_pass(
+    after: bool, write: Callable[[Tensor], None] | None
+) -> None:
+    def step(carry: Tree, u: Tensor, _: Tree) -> tuple[Tree, Tree]:
+        x, unit, fading, count = carry
+        new = x + 0.1 * unit * x.sin() * u * fading.cos()
+        result = (new if after else x).view(-1, 2, 2)
+        return (new, unit, 0.9 * fading, count + (new[:, 0] > 0)), result * 1.0
+
+    program, u = lanes.Program(step, name="carried"), drawn(ROWS, TIMES, 1).requires_grad_()
+    x, unit, fading = (drawn(ROWS, size).requires_grad_() for size in (4, 1, 1))
+    carry, weight = (x, unit, fading, torch.zeros(ROWS).long()), drawn(ROWS, TIMES, 2, 2)
+
+    def slopes(function: Callable[..., Tree]) -> list[Tensor]:
+        (end, *_), history = function(carry, u)
+        total = (weight * history).sum() + end.sum()
+        if write is not None:
+            write(history)
+        return [*torch.autograd.grad(total, [*carry[:3], u])]
+
+    wanted = slopes(program.definition)
+    for unasked in (0, 0, 0, 20):  # the first builds the adjoint, the next keep, the last does not
+        for _ in range(unasked):
+            program(carry, u)
+        close(slopes(program), wanted)
+
+
 @pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")  # of torch's forward mode
 def test_derivatives_of_derivatives_and_transforms_are_those_of_the_definition(
     caplog: pytest.LogCaptureFixture,

@@ -11,6 +11,7 @@ import itertools
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
 from typing import ClassVar
 
 from ..trace.graph import FIXED, FLAG, IN_PLACE, NARROW, NOW, REAL, ROW, STEP, WHOLE, Graph
@@ -267,12 +268,19 @@ class _CppWriter(TableWriter):
             done = 0
             for slot, size in enumerate(self.layout.outputs):
                 entries = outputs[done : done + size]
-                if size > _WRITTEN_OUT:
-                    self._put_by_loop(slot, entries)
-                else:
-                    for (e, node), j in itertools.product(enumerate(entries), range(self.copies)):
-                        self._line(self._put(slot, str(e), self._number(node, self._ref(node, j)), j))
+                with self._braces(f"if (f.data[{slot}])") if self._kept(slot, entries) else nullcontext():
+                    if size > _WRITTEN_OUT:
+                        self._put_by_loop(slot, entries)
+                    else:
+                        for (e, node), j in itertools.product(enumerate(entries), range(self.copies)):
+                            self._line(self._put(slot, str(e), self._number(node, self._ref(node, j)), j))
                 done += size
+
+    def _kept(self, slot: int, entries: Sequence[int]) -> bool:
+        """Return whether an output is a leaf of the carry that a gradient may want, or not."""
+        graph, leaf = self.graph, slot - len(self.layout.outputs) + len(self.layout.carries)
+        states = [("state", (leaf, entry)) for entry in range(len(entries))]
+        return [(graph.op[node], graph.aux[node]) for node in entries] == states
 
     def _put(self, slot: int, entry: str, value: str, j: int) -> str:
         return f"recorder.put({slot}, {entry}, b + {j} * W, rows - {j} * W, {value});"

@@ -6,10 +6,9 @@ import itertools
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from ..emit.schedule import Sizes
 from .graph import NOW, REAL, STEP, Graph
+from .kept_carries import parts
 from .reverse import Reverse
 from .step_copy import StepCopy
 
@@ -36,8 +35,8 @@ def reversed_program(
     old, layout, following, outputs = program
     carries = len(layout.carries)
     ends = [
-        *_parts(following, layout.carries, wanted.carry),
-        *_parts(outputs, layout.outputs, wanted.outputs),
+        *itertools.compress(parts(following, layout.carries), wanted.carry),
+        *itertools.compress(parts(outputs, layout.outputs), wanted.outputs),
     ]
     step = StepCopy(old, layout, [node for part in ends for node in part])
     graph, roots = step.graph, iter(step.roots)
@@ -71,9 +70,3 @@ def reversed_program(
         [slots[each] for each in brought],
     )
     return graph, sizes, after, [node for each in brought for node in found.entries(each)]
-
-
-def _parts(nodes: Sequence[int], sizes: Sequence[int], chosen: Sequence[bool]) -> list[list[int]]:
-    """The nodes of the chosen leaves."""
-    ends = itertools.pairwise(np.cumsum([0, *sizes]).tolist())
-    return [[*nodes[a:b]] for (a, b), one in zip(ends, chosen, strict=True) if one]
