@@ -99,14 +99,15 @@ def test_a_hyperparameter_a_row_is_what_it_would_be_alone(name: str) -> None:
 def test_gradients_reach_everything_that_is_learned_in_every_mode(name: str, radius: str) -> None:
     outputs = 2 if name in ("exponential", "user_defined") else None
     staf, y = learnable(name, radius, outputs=outputs)
-    own = MODES if name == "exponential" else MODES[1::2]
+    turn = [*LEARNABLE_KERNELS].index(name) % 2  # kernels take turns with the modes
+    own = MODES if name == "exponential" else MODES[1 + 2 * turn :][:1]
     for mode in own if radius == "shrinking" else MODES[::2]:
         function, at = as_function(staf, mode, target_of(outputs))
         inputs = (y[:1].requires_grad_(), *at)
         assert torch.autograd.gradcheck(function, inputs, atol=1e-5, rtol=1e-4, fast_mode=True), mode
 
 
-@pytest.mark.parametrize("name", ["exponential", "gaussian", "matern52", "polynomial"])
+@pytest.mark.parametrize("name", ["exponential", "matern52"])
 def test_second_derivatives_are_right(name: str) -> None:
     staf, y = learnable(name, "shrinking")
     function, at = as_function(staf, "value", Paper())

@@ -55,13 +55,13 @@ def test_environment_passes_the_checker_of_gymnasium(name: str) -> None:
 
 @pytest.mark.parametrize("name", list(envs.PLANTS))
 def test_row_of_the_vectorised_environment_is_the_single_one(name: str) -> None:
-    many = gymnasium.make_vec(name, num_envs=3, horizon=0.05)
+    many = gymnasium.make_vec(name, num_envs=2, horizon=0.03)
     seen, _ = many.reset(seed=7)
     many.action_space.seed(1)
-    actions = [0.1 * many.action_space.sample() for _ in range(5)]
+    actions = [0.1 * many.action_space.sample() for _ in range(3)]
     histories = [(seen, None, None, None), *(many.step(action)[:4] for action in actions)]
-    for row in range(3):
-        one = gymnasium.make(name, horizon=0.05)
+    for row in range(2):
+        one = gymnasium.make(name, horizon=0.03)
         first, _ = one.reset(seed=7 + row)
         np.testing.assert_array_equal(first, histories[0][0][row])
         for action, expected in zip(actions, histories[1:], strict=True):
@@ -97,7 +97,7 @@ def test_environments_of_plants_with_numbers_of_their_own_are_single_ones() -> N
 
 @pytest.mark.parametrize("make", [lambda: adp.Feedback(LQR), rollout, learner])
 def test_rewards_of_an_episode_add_up_to_minus_the_cost_of_the_simulation(make) -> None:  # type: ignore[no-untyped-def]
-    steps, x0 = 20, torch.tensor([[-1.0, 1.0], [0.5, 0.7]], dtype=torch.float64)
+    steps, x0 = 10, torch.tensor([[-1.0, 1.0], [0.5, 0.7]], dtype=torch.float64)
     wanted = adp.simulate(make(), PLANT, COST, x0, dt=0.01, steps=steps)
     many = gymnasium.make_vec("staf_torch/TwoState-v0", num_envs=2, horizon=100.0, bound=1000.0)
     seen, _ = many.reset(options={"state": x0.numpy()})

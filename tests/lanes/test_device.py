@@ -148,7 +148,7 @@ def test_a_history_without_room_on_a_device_comes_to_the_processor_with_the_same
     for name, (memory, call) in calls.items():
         with lanes.device.host():
             wanted = flatten(call())[0]
-        for _ in range(3):
+        for _ in range(2):
             with lanes.device.host(memory=memory):
                 found = flatten(call())[0]
             for one, other in zip(found, wanted, strict=True):

@@ -116,7 +116,7 @@ def exact(name: str, x: float, y: float) -> Any:
 def test_functions_are_within_their_bounds_over_the_whole_range(
     dtype: torch.dtype, program: lanes.Program
 ) -> None:
-    x = points(dtype, 200)
+    x = points(dtype, 120)
     y = x.flip(0)
     assert program.compiles((), (), (x, y), steps=1)
     found = program((), (), (x, y), steps=1)[1]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from helpers import random_positive_definite, uniform
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as some
 from variants import DESCENDING, LAWS, RATED, over
 
@@ -77,6 +77,7 @@ def test_excess_contracts_at_the_promised_rate(name: str, seed: int, log_conditi
 
 
 @over(DESCENDING)
+@settings(max_examples=10)
 @given(seed=SEEDS)
 def test_law_finds_the_ideal_weights(name: str, seed: int) -> None:
     objective = problem(seed, log_condition=0.5)
