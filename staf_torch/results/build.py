@@ -195,6 +195,8 @@ def _named(settings: Mapping[str, Any]) -> Iterator[str]:
     """The dotted paths outside the package that settings name."""
     for key, value in settings.items():
         group, _, last = key.rpartition(".")
+        if last not in ("_target_", "path", "task"):
+            continue
         target = str(settings.get(f"{group}._target_"))
         ours = f"{_PACKAGE.name}."
         loads = target.startswith(ours) and target.rpartition(".")[2].islower()  # a function of ours

@@ -5,6 +5,7 @@ They are read by `untrusted`.
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import os
@@ -37,6 +38,7 @@ def grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list
     return groups
 
 
+@functools.lru_cache(4096)  # a table of a thousand rows asks for the same keys a thousand times
 def is_free(line: str) -> bool:
     """Return whether an override, or a dotted key, is about one of `FREE`."""
     return re.split(r"[.=@/]", line.lstrip("+~"), maxsplit=1)[0] in FREE
