@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,19 @@ from helpers_experiments import run, words
 from helpers_swingup import double_integrator
 from pretend_device import DEVICE, Elsewhere
 from torch import Tensor
-from variants import ACTOR_CRITIC_LAWS, KERNELS, LAWS, PLANTS, PREDICTORS, VALUE_BASES, by_turns, over
+from variants import (
+    ACTOR_CRITIC_LAWS,
+    COSTS,
+    KERNELS,
+    LAWS,
+    PLANTS,
+    PREDICTORS,
+    RADII,
+    TARGETS,
+    VALUE_BASES,
+    by_turns,
+    over,
+)
 
 import staf_torch as st
 from staf_torch import adp, lanes, online, systems, targets
@@ -193,3 +206,161 @@ def test_a_memory_of_local_models_is_where_the_first_of_them_was() -> None:
         one(x)
     with pytest.raises(ValueError, match=r"`ExperienceMemory.add\(x=...\)` must be on cpu"):
         other.add(there(x[0]), there(torch.zeros(6, dtype=torch.float64)))
+
+
+# The meta device: shapes, dtypes and structure of what a call returns, and nothing is computed.
+
+META = torch.device("meta")
+
+
+def form(result: Any, device: torch.device) -> Any:
+    """What a result is but for its numbers, all of which are on a device."""
+    if isinstance(result, Tensor):
+        assert result.device == device
+        return tuple(result.shape), result.dtype
+    if dataclasses.is_dataclass(result) and not isinstance(result, type):
+        fields = (f.name for f in dataclasses.fields(result) if f.compare and f.name != "time")
+        result = {name: getattr(result, name) for name in fields}
+    if isinstance(result, dict):
+        return {name: form(part, device) for name, part in result.items()}
+    parts = result if isinstance(result, tuple | list) else ()
+    return type(result), *(form(part, device) for part in parts)
+
+
+def around(state: Tensor, kernel: str, radius: str) -> Any:
+    centers = st.StateFollowingCenters(st.rings(6), RADII[radius][0]())
+    return st.StaFBasis(KERNELS[kernel].make(), centers).to(state.device)
+
+
+def evaluated(x: Tensor, kernel: str, radius: str, target: str) -> Any:
+    basis, function = around(x, kernel, radius), TARGETS[target][0]()
+    fitted, y = st.StaF(basis, (len(x),)).fit_(x, function), x.unsqueeze(-2) + 0.01
+    smooth = KERNELS[kernel].derivatives
+    slopes = (
+        [fitted.gradient(y, mode) for mode in ("partial", "total_frozen_weights", "total")] if smooth else []
+    )
+    bent = [fitted.hessian(y)] if smooth > 1 else []
+    weights = basis.ideal_weights(x, function)
+    return fitted(y), fitted.weights, *slopes, *bent, basis.gram(x), basis.excess(weights, x, function)
+
+
+def chased(x: Tensor, law: str, kernel: str, predictor: str, times: int = 20) -> Any:
+    states, basis = x.unsqueeze(1).expand(-1, times, -1), around(x, kernel, "shrinking")
+    more: dict[str, Any] = {"predictor": PREDICTORS[predictor]}
+    result = st.chase(states, basis, targets.Paper(), LAWS[law], certificate=True, **more)
+    return result, st.chase_weights(states, basis, targets.Paper(), LAWS[law], history=False, **more)
+
+
+def moving(x: Tensor, name: str, steps: int = 20) -> Any:
+    plant = PLANTS[name]().to(x.device)
+    start = x.new_full((3, plant.equilibrium().numel()), 0.1)
+    cost = adp.QuadraticCost(1.0, 1.0, start.shape[1], plant.inputs).to(x.device)
+    loop = adp.simulate(lambda x: -x[..., : plant.inputs], plant, cost, start, dt=0.01, steps=steps, every=2)
+    return systems.simulate(plant, start, dt=0.01, steps=steps), loop
+
+
+def paid(x: Tensor, name: str) -> Tensor:
+    cost = COSTS[name]().to(x.device)
+    return cost.rate(x.new_ones(3, cost.dim), x.new_ones(3, cost.inputs))
+
+
+def streamed(x: Tensor, name: str) -> Any:
+    states = x.expand(7, -1, -1)
+    y = states.sum(-1)
+    model = REGRESSORS[name](states, y).fit(states, y).partial_fit(x, y[0], lapse=0.5)
+    return model.predict(x, return_std=True), model.forecast(states, y).mean, model.smooth(states, y)
+
+
+def looped(x: Tensor, name: str) -> Any:
+    plant, cost = systems.TwoState(), adp.QuadraticCost(1.0, 1.0, 2, 1, low=-5.0, high=5.0)
+    controller = controllers(plant, cost)[name]
+    kept = adp.simulate(controller, plant, cost, x, dt=0.01, steps=4, every=2)
+    assert not any(each.is_meta for each in (*plant.buffers(), *cost.buffers()))
+    if isinstance(controller, adp.Controller):  # and where all of it is on the device
+        controller, plant, cost = (copy.deepcopy(part).to(x.device) for part in (controller, plant, cost))
+    return kept, adp.simulate(controller, plant, cost, x, dt=0.01, steps=4, every=2)
+
+
+def turns(*tables: Any) -> list[tuple[str, ...]]:
+    """Variants of several kinds, each in its turn beside one of the others."""
+    return [tuple(list(each)[k % len(each)] for each in tables) for k in range(max(map(len, tables)))]
+
+
+def held(x: Tensor, policy: str) -> Any:
+    plant, cost = systems.Pendulum(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, low=-3.0, high=3.0)
+    made = {
+        "a filter": lambda: adp.SafetyFilter(
+            adp.LQR(plant, cost), plant, lambda x, t: 1 - x.square().sum(-1), dt=0.01
+        ),
+        "near_optimal": lambda: adp.near_optimal(plant, cost, dt=0.05, reach="local"),
+    }[policy]()
+    return copy.deepcopy(made).to(x.device)(x)
+
+
+LOOPS = list(controllers(systems.TwoState(), adp.QuadraticCost(1.0, 1.0, 2, 1)))
+FORMAL: dict[str, Callable[[Tensor], Any]] = {
+    **{f"basis of {', '.join(c)}": lambda x, c=c: evaluated(x, *c) for c in turns(KERNELS, RADII, TARGETS)},
+    **{f"chase by {', '.join(c)}": lambda x, c=c: chased(x, *c) for c in turns(LAWS, KERNELS, PREDICTORS)},
+    **{f"plant {name}": lambda x, n=name: moving(x, n) for name in PLANTS},
+    **{f"cost {name}": lambda x, n=name: paid(x, n) for name in COSTS},
+    **{f"value basis {name}": lambda x, n=name: VALUE_BASES[n]().to(x.device)(x, x) for name in VALUE_BASES},
+    **{f"stream, {name}": lambda x, n=name: streamed(x, n) for name in REGRESSORS if name[0] in "fnk"},
+    **{f"loop with {name}": lambda x, n=name: looped(x, n) for name in LOOPS},
+    **{f"policy {name}": lambda x, n=name: held(x, n) for name in ("a filter", "near_optimal")},
+}
+
+
+@over(FORMAL)
+def test_on_the_meta_device_a_call_returns_all_but_the_numbers(name: str) -> None:
+    with lanes.compiling("never"):
+        wanted = FORMAL[name](X0)
+    found = FORMAL[name](X0.to(META))
+    assert form(found, META) == form(wanted, X0.device)
+    assert repr(found)
+
+
+def test_on_the_meta_device_a_million_steps_are_one() -> None:
+    x, steps = X0.to(META).requires_grad_(), 10**6
+    plant, cost = systems.Pendulum(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+    states = systems.simulate(plant, x, dt=0.01, steps=steps)
+    loop = adp.simulate(adp.LQR(plant, cost), plant, cost, x, dt=0.01, steps=steps, compile=True)
+    basis = st.StaFBasis(st.GaussianKernel(), st.StateFollowingCenters(st.rings(6), 0.1))
+    chase = st.chase(states, basis, targets.Paper(), LAWS["exact"], inner_steps=steps)
+    assert states.shape == loop.state.shape == (2, steps + 1, 2)
+    assert chase.weights.shape == (2, steps + 1, 6)
+    (slope,) = torch.autograd.grad(chase.excess.sum() + loop.cost.sum(), x)
+    assert (slope.shape, slope.device) == (x.shape, META)
+
+
+def test_a_basis_built_on_the_meta_device_has_shapes_before_it_has_values() -> None:
+    following = st.StateFollowingCenters(st.rings(6).to(META), 0.1)
+    basis, x = st.StaFBasis(st.GaussianKernel(), following), X0.to(META)
+    assert basis.ideal_weights(x, targets.Paper()).shape == (2, 6)
+    with pytest.raises(ValueError, match="must be given its values first"):
+        basis.ideal_weights(X0, targets.Paper())
+
+
+def decided(name: str) -> Any:
+    x, plant, cost = X0.to(META), systems.Pendulum(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+    there_, cost_there = copy.deepcopy(plant).to(META), copy.deepcopy(cost).to(META)
+    problem = adp.SampledProblem.of(plant, cost, dt=0.05)
+    return {
+        "LQR": lambda: adp.LQR(there_, cost_there),
+        "near_optimal": lambda: adp.near_optimal(there_, cost_there, dt=0.05),
+        "SampledProblem": lambda: adp.SampledProblem.of(there_, cost_there, dt=0.05),
+        "BoxDDP": lambda: adp.BoxDDP(problem, steps=3).solve(x),
+        "StaFRegressor.tune": lambda: st.StaFRegressor().tune(x, x[:, 0]),
+        "MixtureRegressor": lambda: online.MixtureRegressor().fit(x, x[:, 0]),
+        "simulate": lambda: adp.simulate(
+            lambda x: x[:, :1] if x.sum() else x, plant, cost, x, dt=1.0, steps=1
+        ),
+    }[name]()
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["LQR", "near_optimal", "SampledProblem", "BoxDDP", "StaFRegressor.tune", "MixtureRegressor", "simulate"],
+)
+def test_what_numbers_decide_is_refused_on_the_meta_device(name: str) -> None:
+    with pytest.raises(ValueError, match=rf"`{name}.*must have numbers, which decide .* meta"):
+        decided(name)

@@ -171,7 +171,7 @@ class StaFBasis(nn.Module, metaclass=Rowwise):
 
     def largest_reach(self, x: Tensor) -> float:
         """The largest finite |x| nu(x) over the states (..., n); 0 for a kernel that does not mind."""
-        if self.kernel.log_gain(x) is None:
+        if x.is_meta or self.kernel.log_gain(x) is None:
             return 0.0
         reach = over_rows(lambda at: at.norm(dim=-1) * self.centers.radius(at), x).detach()
         known = torch.where(torch.isfinite(reach), reach, 0.0)

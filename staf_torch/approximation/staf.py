@@ -13,7 +13,7 @@ from torch.nn.utils import parametrize
 from ..lanes.gradients import refuse_gradient
 from ..lanes.one_thread import alone
 from ..lanes.row_objects import refuse_rows
-from ..numerics.checks import beside_batch, choice, fail, flag, hold, integer, trailing
+from ..numerics.checks import beside_batch, choice, fail, fails, flag, hold, integer, trailing
 from ..numerics.default_device import beside
 from ..numerics.linalg import row_jacobian
 from ..numerics.row_checks import check_target
@@ -125,7 +125,7 @@ class StaF(nn.Module):
         w = self._weights()
         w = w if self.out_features is None else w.movedim(0, -2)
         lost = torch.isnan(w).any(-1) & torch.isfinite(self.coefficients).all(-1)
-        if bool(lost.any()):
+        if fails(~lost):
             rows = lost.nonzero().tolist() if lost.dim() else []
             where = f" of the batch entries {rows[:5]}" if rows else ""
             raise ValueError(
@@ -146,7 +146,7 @@ class StaF(nn.Module):
             ValueError: if x is not of the shape (*batch_shape, n), the target returns another shape, or one
                 requires a gradient; the module then stays as it was.
         """
-        trailing("StaF.fit_", "x", x, dims=1, last=self.basis.dim, meta=False, vmap=False)
+        trailing("StaF.fit_", "x", x, dims=1, last=self.basis.dim, meta=self.state.is_meta, vmap=False)
         if x.shape != self.state.shape:
             raise ValueError(
                 f"`StaF.fit_(x=...)` must have the shape {tuple(self.state.shape)}; got {tuple(x.shape)}."

@@ -53,13 +53,13 @@ class Problem:
 
     def check_states(self, states: Tensor) -> None:
         """Refuse states that are not (B, T, n) with at least one of each."""
-        trailing(self.call, "states", states, dims=3, last=self.basis.dim, meta=False, vmap=False)
+        trailing(self.call, "states", states, dims=3, last=self.basis.dim, vmap=False)
         if states.dim() != 3 or 0 in states.shape:
             raise ValueError(
                 f"`{self.call}(states=...)` must have the shape (B, T, n); got {tuple(states.shape)}."
             )
         directions = self.basis.centers.directions
-        if directions.is_meta:
+        if directions.is_meta and not states.is_meta:
             raise fail(self.call, "basis", "must have its values: it was built on the meta device", None)
         check_target(self.target, states, sizes=directions.shape)
         if len(states) in directions.shape:  # a shape alone says nothing then

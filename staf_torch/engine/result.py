@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from torch import Tensor
 
 from ..lanes.device.chunks import joined
-from ..numerics.repr_text import span
+from ..numerics.repr_text import count, span
 from .certificate import Certificate
 
 
@@ -50,11 +50,11 @@ class ChaseResult:
         return self.diverged_at >= 0
 
     def __repr__(self) -> str:
-        rows, times, count = self.weights.shape
+        rows, times, centers = self.weights.shape
         return (
-            f"ChaseResult({rows} trajectories, {times} times, {count} centers; at the last time |V - V^| "
+            f"ChaseResult({rows} trajectories, {times} times, {centers} centers; at the last time |V - V^| "
             f"{span((self.value - self.estimate)[:, -1].abs())}, excess {span(self.excess[:, -1])}; "
-            f"{int(self.diverged.sum())} diverged)"
+            f"{count(self.diverged)} diverged)"
         )
 
 
@@ -81,9 +81,9 @@ class ChaseWeights:
         return self.diverged_at >= 0
 
     def __repr__(self) -> str:
-        rows, times, count = self.weights.shape
-        lost = int(self.diverged.sum())
-        return f"ChaseWeights({rows} trajectories, {times} times, {count} centers; {lost} diverged)"
+        rows, times, centers = self.weights.shape
+        size = f"{rows} trajectories, {times} times, {centers} centers"
+        return f"ChaseWeights({size}; {count(self.diverged)} diverged)"
 
 
 def concatenate(pieces: Iterable[ChaseResult]) -> ChaseResult:

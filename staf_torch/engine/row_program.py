@@ -152,9 +152,10 @@ def program(problem: Problem, states: Tensor, carry: RowCarry, *, everything: bo
         carry: what it starts from.
         everything: whether all results are wanted, or the weights alone.
     """
-    if not worth(states.shape[1] >= SHORTEST, states):
+    formal = states.is_meta  # of which a program needs one time alone
+    if not formal and not worth(states.shape[1] >= SHORTEST, states):
         return None
-    if not served((states, carry.chase.weights)):
+    if not formal and not served((states, carry.chase.weights)):
         say_transformed("the chase")
         return None
     settings = settings_of(problem, states, everything)
@@ -171,7 +172,7 @@ def program(problem: Problem, states: Tensor, carry: RowCarry, *, everything: bo
 
         parts = problem.basis, _plain(problem.target), problem.law, problem.predictor, settings
         made = kept.of(make(*parts), *parts, owners=owners, make=make)
-    return made if made.compiles(carry, states) else None
+    return made if formal or made.compiles(carry, states) else None
 
 
 def _plain(target: Target) -> Target:

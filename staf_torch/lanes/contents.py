@@ -399,8 +399,8 @@ class Walk(pickle.Pickler):
     def _tensor(self, value: Tensor) -> Any:
         if not value.is_floating_point():
             self.others.append(value)
-            plain = value.detach().cpu()
-            return str(value.dtype), str(value.device), tuple(value.shape), plain.numpy().tobytes()
+            numbers = b"" if value.is_meta else value.detach().cpu().numpy().tobytes()
+            return str(value.dtype), str(value.device), tuple(value.shape), numbers
         if id(value) not in self._places:
             self._places[id(value)] = len(self.tensors)
             self.tensors.append(value)

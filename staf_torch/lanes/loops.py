@@ -57,7 +57,7 @@ def repeat(
             carry = body(carry)
             continue
         going = where(carry)
-        if not (tracing_now() or torch._C._functorch.peek_interpreter_stack()) and not bool(going.any()):
+        if not _unread(going) and not bool(going.any()):
             break
         carry = _chosen(going, body(carry), carry)
     return carry
@@ -129,7 +129,7 @@ def where_rows(where: Tensor, body: Callable[[Tree], Some], given: Tree, otherwi
         start = otherwise, given
         chosen: Some = repeat(1, lambda now: (body(now[1]), now[1]), start, where=lambda _: where)[0]
         return chosen
-    if tracing_now() or torch._C._functorch.peek_interpreter_stack():
+    if _unread(where):
         every: Some = _chosen(where, body(given), otherwise)
         return every
     rows = where.nonzero().squeeze(1)
@@ -269,6 +269,11 @@ def _reduced(values: Tensor, operation: str, dim: int) -> Tensor:
 def _unsqueezed(tree: Tree, dim: int) -> Tree:
     leaves, structure = flatten(tree)
     return unflatten(structure, iter([leaf.unsqueeze(dim) for leaf in leaves]))
+
+
+def _unread(mask: Tensor) -> bool:
+    """Return whether nobody may look which rows a mask has."""
+    return mask.is_meta or tracing_now() or torch._C._functorch.peek_interpreter_stack() is not None
 
 
 @contextmanager

@@ -45,9 +45,10 @@ def compiling(when: str) -> Iterator[None]:
         _when = before
 
 
-def undecided(compile: bool | str = "auto") -> bool:
-    """Return whether a caller, and `compiling`, leave the choice to the library."""
-    return compile == "auto" and _when == "auto"
+def undecided(compile: bool | str = "auto", states: Tensor | None = None) -> bool:
+    """Return whether a caller, and `compiling`, leave the choice to the library; on the meta device there is
+    none."""
+    return compile == "auto" and _when == "auto" and not (states is not None and states.is_meta)
 
 
 def worth(pays: bool, states: Tensor | None = None) -> bool:
@@ -56,8 +57,11 @@ def worth(pays: bool, states: Tensor | None = None) -> bool:
     Args:
         pays: whether a call pays for a compiler on the processor.
         states: of a loop, which on a device always pays: plain torch there waits for a launch at every
-            operation, some hundred times as long as the operation takes.
+            operation, some hundred times as long as the operation takes; on the meta device nothing takes
+            time.
     """
+    if states is not None and states.is_meta:
+        return False
     if _when != "auto":
         return _when == "always"
     return pays or (states is not None and runs_kernels(states))

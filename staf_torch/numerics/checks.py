@@ -91,6 +91,12 @@ def _in_all_rows(
     raise fail(call, name, f"{rule} in every row, which it is not in row {row}", numbers[row])
 
 
+def fails(rule: Tensor) -> bool:
+    """Return whether a rule (...), bool, is broken in an entry; on the meta device nobody can look, and it is
+    not."""
+    return not rule.is_meta and not bool(rule.all())
+
+
 def own_number(call: str, name: str, value: object, sign: str = "any") -> Any:
     """Return a finite number, or a tensor of one: of `rows`, one a row.
 
@@ -256,7 +262,9 @@ def trailing(
                 f"got the shape {tuple(shape)}."
             )
         if not meta and value.is_meta:
-            raise ValueError(f"`{call}({name}=...)` must have numbers; got a tensor on the device meta.")
+            raise ValueError(
+                f"`{call}({name}=...)` must have numbers, which decide here; got one on the device meta."
+            )
         if not vmap and torch._C._functorch.is_batchedtensor(value):
             rule = "must hold all rows at once, and not one by one as under `torch.func.vmap`"
             raise ValueError(f"`{call}({name}=...)` {rule}; flatten its dimension into the rows.")

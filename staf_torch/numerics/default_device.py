@@ -42,7 +42,7 @@ def beside(function: Callable[Given, Found]) -> Callable[Given, Found]:
             with torch.device(next(given, torch.device("cpu"))):
                 return function(*args, **more)
         except RuntimeError as error:
-            if (instead := explained(error)) is error:
+            if (instead := explained(error, function.__qualname__)) is error:
                 raise
             raise instead from error
 
@@ -52,6 +52,12 @@ def beside(function: Callable[Given, Found]) -> Callable[Given, Found]:
 def device_of(*given: object) -> torch.device:
     """Return the device of the first tensor among tensors and those that modules hold, else the CPU."""
     return next((each.device for each in _tensors(given)), torch.device("cpu"))
+
+
+def without_numbers(*given: object) -> bool:
+    """Return whether a tensor among tensors and those that modules hold is on the meta device, so that
+    nothing can be decided by its numbers."""
+    return any(each.is_meta for each in _tensors(given))
 
 
 def designed_on_cpu(function: Callable[Given, Found]) -> Callable[Given, Found]:
@@ -67,6 +73,9 @@ def designed_on_cpu(function: Callable[Given, Found]) -> Callable[Given, Found]:
         device = next(devices, None)
         if device is None:
             return function(*args, **more)
+        if device.type == "meta":
+            rule = "numbers decide, and the meta device has none: compute on the CPU"
+            raise ValueError(f"in `{function.__name__}` {rule}, and move what is made there.")
         args, more = tree_map_only(Tensor, Tensor.cpu, (args, more))
         found: Found = tree_map_only(Tensor, lambda each: each.to(device), function(*args, **more))
         return found

@@ -36,13 +36,18 @@ def condition_number(gram: Tensor) -> Tensor:
     return torch.where(finite, ratio, torch.nan)
 
 
-def _symmetric(call: str, name: str, matrix: Tensor, size: int) -> None:
+def _eigenvalues(call: str, name: str, matrix: Tensor, size: int) -> Tensor | None:
+    """Return the eigenvalues of a matrix, refused if it is not symmetric; None on the meta device."""
     if matrix.shape != (size, size):
         raise fail(call, name, f"must be ({size}, {size})", matrix)
+    if matrix.is_meta:
+        return None
     if not bool(torch.isfinite(matrix).all()):
         raise fail(call, name, "must be finite", matrix)
     if bool(((matrix - matrix.mT).abs() > 1e-12 * matrix.abs()).any()):
         raise fail(call, name, "must be symmetric", matrix)
+    values: Tensor = torch.linalg.eigvalsh(matrix.detach())
+    return values
 
 
 def square(call: str, name: str, value: Matrix, size: int) -> Tensor:
@@ -75,8 +80,8 @@ def positive_definite(call: str, name: str, matrix: Tensor, size: int) -> Tensor
     Raises:
         ValueError: if it is anything else.
     """
-    _symmetric(call, name, matrix, size)
-    if bool(torch.linalg.eigvalsh(matrix.detach())[0] <= 0):
+    values = _eigenvalues(call, name, matrix, size)
+    if values is not None and bool(values[0] <= 0):
         raise fail(call, name, "must be positive definite", matrix)
     return matrix.to(torch.float64)
 
@@ -87,9 +92,8 @@ def positive_semidefinite(call: str, name: str, matrix: Tensor, size: int) -> Te
     Raises:
         ValueError: if it is anything else.
     """
-    _symmetric(call, name, matrix, size)
-    values = torch.linalg.eigvalsh(matrix.detach())
-    if bool(values[0] < -1e-12 * values.abs().max()):
+    values = _eigenvalues(call, name, matrix, size)
+    if values is not None and bool(values[0] < -1e-12 * values.abs().max()):
         raise fail(call, name, "must be positive semidefinite", matrix)
     return matrix.to(torch.float64)
 

@@ -24,7 +24,7 @@ def shown(value: Any) -> str:
         return f"{value:.4g}"
     if isinstance(value, RowNumbers):
         return f"rows({shown(value.full)})"
-    if value.numel() > _MOST:
+    if value.numel() > _MOST or value.is_meta:
         return f"a tensor {tuple(value.shape)}"
     if value.dim() == 2 and 1 < len(value) == value.shape[1] and torch.equal(value, value.diag().diag()):
         return f"diag({', '.join(map(shown, value.diag().tolist()))})"
@@ -53,8 +53,15 @@ def limits(bounds: Any) -> list[str]:
     return [] if bounds is None else [f"low={shown(bounds.low)}", f"high={shown(bounds.high)}"]
 
 
+def count(mask: Tensor) -> str:
+    """Return the number of entries in which a mask holds; `?` on the meta device."""
+    return "?" if mask.is_meta else str(int(mask.sum()))
+
+
 def span(values: Tensor) -> str:
     """Return `0.1 to 0.7` of the finite ones, `none found` where there are none."""
+    if values.is_meta:
+        return "on the meta device"
     finite = values.detach()[torch.isfinite(values)]
     if not len(finite):
         return "none found"

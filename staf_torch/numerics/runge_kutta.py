@@ -83,7 +83,8 @@ def stage_weights(length: float | Tensor, discount: float, like: Tensor) -> tupl
         left = 1.0 if isinstance(counts, Tensor) else counts
         between = (h / 2, h / 3, left * h / 3)
         table = ((0.0, h / 6, h / 6), between, between, (h, h / 6, left**2 * h / 6))
-        asked, counted, worth = torch.tensor(table, dtype=like.dtype, device=like.device).unbind(-1)
+        # Not `torch.tensor`, which torch.func does not take on the meta device.
+        asked, counted, worth = torch.as_tensor(table, dtype=like.dtype, device=like.device).unbind(-1)
         if isinstance(counts, Tensor):  # of a row's own, or of the table
             shares = torch.stack((torch.ones_like(counts), counts, counts, counts.square()))
             worth = counted * shares.to(like)

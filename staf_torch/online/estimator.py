@@ -81,7 +81,9 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         states, values = pair(self._call("fit"), x, y, (2, 3))
         lapse, twin = lapses(self._call("fit"), time, states), self._twin()
         with Sign(self._call("fit"), len(states), "samples") as sign:
-            one_by_one = () if twin._stretch(states, values, lapse) else zip(states, values, strict=True)
+            count = 1 if states.is_meta else len(states)  # a sample has the shapes of all
+            learned = twin._stretch(states, values, lapse)
+            one_by_one = () if learned else zip(states[:count], values[:count], strict=True)
             for k, (state, value) in enumerate(one_by_one):
                 if lapse is None:
                     twin.partial_fit(state, value)
@@ -159,7 +161,7 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         targets = self._placed("partial_fit", "y", values).reshape(streams.count, -1).contiguous()
         if targets.shape[1] != (self.n_outputs_ or 1):
             raise self._refusal("partial_fit", states, values)
-        times = None if lapse is None else lapse.expand(streams.count).contiguous()
+        times = None if lapse is None else lapse.to(rows.device).expand(streams.count).contiguous()
         if not torch._C._len_torch_function_stack():
             streams.learn(rows, targets, times)
             return

@@ -119,7 +119,7 @@ class FilterStreams:
 
     def learn(self, x: Tensor, y: Tensor, lapse: Tensor | None = None) -> None:
         """Learn one sample a stream: (S, n), (S, K), (S,)."""
-        if not self.scaling:
+        if not self.scaling or x.is_meta:  # without numbers there are no units to learn
             self._filter.learn(self.state, x, y, lapse)
             return
         n, both = self.state.dim, torch.cat((x, y), 1).double()

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..kernels import Kernel
 from ..lanes.row_numbers import RowNumbers, all_rows, columns
-from ..numerics.checks import fail, own_number
+from ..numerics.checks import fail, fails, own_number
 from ..numerics.linalg import root
 from ..numerics.pivoted_cholesky import newton_basis
 
@@ -108,7 +108,7 @@ def own_law(
         ("forgetting", found["forgetting"] <= 1, "must be in (0, 1]"),
     )
     for name, held, rule in rules:
-        if not bool(held.all()):
+        if fails(held):
             row = int((~held).nonzero()[0])
             raise fail(
                 call, name, f"{rule} in every row, which it is not in row {row}", float(found[name][row])

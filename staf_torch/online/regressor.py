@@ -16,7 +16,7 @@ from ..centers.layouts import RING_COUNTS
 from ..kernels import NAMED, GaussianKernel, Kernel
 from ..lanes.gradients import refuse_gradient
 from ..lanes.row_numbers import RowNumbers
-from ..numerics.checks import choice, fail, flag, integer, positive_real, real
+from ..numerics.checks import choice, fail, flag, integer, positive_real, real, trailing
 from ..numerics.default_device import device_of, on
 from ..signs import Sign
 from .estimator import StreamEstimator
@@ -154,6 +154,7 @@ class StaFRegressor(StreamEstimator):
         """
         choice(f"{_NAME}.tune", "method", method, ("search", "gradient"))
         states, values = pair(f"{_NAME}.tune", x, y, (2, 3))
+        trailing(f"{_NAME}.tune", "x", states, 2, meta=False)
         states = turned_in_time(states, self._angles(states.shape[-1]))
         targets = values if values.dim() == states.dim() else values.unsqueeze(-1)
         rows = [part.unsqueeze(1) if states.dim() == 2 else part for part in (states, targets)]
@@ -420,6 +421,8 @@ class StaFRegressor(StreamEstimator):
 
 def _check_reach(functions: LocalFunctions, radius: float) -> None:
     """Raise where the kernel overflows within the ball, and log one that is narrow for it."""
+    if functions.offsets.is_meta:
+        return
     explained, kernel = functions.explained(), type(functions.kernel).__name__
     if math.isnan(explained) and functions.shared is not None:
         rule = f"must be so small that {kernel} does not overflow within the ball"

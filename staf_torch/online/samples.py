@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..lanes.call import readable
 from ..lanes.gradients import refuse_gradient
-from ..numerics.checks import fail
+from ..numerics.checks import fail, fails
 
 
 def tensor_of(call: str, name: str, value: Any, *, recorded: bool = False) -> Tensor:
@@ -35,8 +35,6 @@ def tensor_of(call: str, name: str, value: Any, *, recorded: bool = False) -> Te
             raise ValueError(
                 f"`{call}({name}=...)` must be a dense tensor of real numbers; got one that is {form}."
             )
-        if value.is_meta:
-            raise ValueError(f"`{call}({name}=...)` must have numbers; got a tensor on the device meta.")
         found = value if recorded else value.detach()
     else:
         try:
@@ -110,10 +108,10 @@ def lapses(call: str, time: Any, states: Tensor) -> Tensor | None:
     given = tensor_of(call, "time", time).double()
     steps = given.diff(dim=0)
     fits = tuple(given.shape) in {(len(states),), tuple(states.shape[:-1])}
-    if not fits or not bool(given.isfinite().all() and (steps >= 0).all() and steps.isfinite().all()):
+    if not fits or fails(given.isfinite().all() & (steps >= 0).all() & steps.isfinite().all()):
         streams = "" if states.dim() == 2 else f" or {tuple(states.shape[:-1])}"
         raise fail(call, "time", f"must be finite and increasing, ({len(states)},){streams}", time)
-    return torch.cat((torch.ones_like(given[:1]), steps)).reshape(len(states), -1)
+    return torch.cat((torch.ones_like(given[:1]), steps)).reshape(len(states), -1).to(states.device)
 
 
 def lapse_of(call: str, lapse: Any, streams: int) -> Tensor:
@@ -124,7 +122,7 @@ def lapse_of(call: str, lapse: Any, streams: int) -> Tensor:
     """
     given = tensor_of(call, "lapse", lapse).double()
     fits = given.dim() <= 1 and given.numel() in (1, streams)
-    if not fits or not bool(((given >= 0) & (given < torch.inf)).all()):
+    if not fits or fails((given >= 0) & (given < torch.inf)):
         told = f"must be finite and not negative, () or ({streams},)"
         raise fail(call, "lapse", told, lapse)
     return given.expand(streams).contiguous()

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..lanes.row_objects import by_rows
 from ..numerics.angles import wrap
-from ..numerics.checks import fail, hold, numbers_of, states
+from ..numerics.checks import fail, fails, hold, numbers_of, states
 from .base import ControlAffineSystem, Linearisation, Units
 
 Wall = float | Sequence[float | None] | Tensor | None
@@ -107,9 +107,9 @@ class Barrier(ControlAffineSystem):
         """
         low, high, center = self.low.to(x), self.high.to(x), self.center.to(x)
         x = center + wrap(x - center, self._turning) if self._turning else x
-        outside = ~((x > low) & (x < high)).all(-1)
-        if bool(outside.any()):
-            rows = outside.flatten().nonzero().flatten().tolist()
+        inside = ((x > low) & (x < high)).all(-1)
+        if fails(inside):
+            rows = (~inside).flatten().nonzero().flatten().tolist()
             named = ", ".join(map(str, rows[:_NAMED])) + (" and more" if len(rows) > _NAMED else "")
             first = x.reshape(-1, x.shape[-1])[rows[0]].tolist()
             raise ValueError(

@@ -54,7 +54,7 @@ class Bounds:
     @property
     def present(self) -> bool:
         """Return whether any input is bounded, of numbers of rows in any row."""
-        return any(in_any_row(torch.isfinite(limit)) for limit in (self.low, self.high))
+        return self.low.is_meta or any(in_any_row(torch.isfinite(limit)) for limit in (self.low, self.high))
 
     def clip(self, u: Tensor) -> Tensor:
         """The nearest admissible input: (..., m) -> (..., m)."""

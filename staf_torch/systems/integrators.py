@@ -69,7 +69,7 @@ def trajectory(
         rule = "must be a plant with a `drift`: x' = f(x) + g(x) u, of which f is followed"
         rule = "must be an object, and is the class" if isinstance(system, type) else rule
         raise fail("trajectory", "system", rule, system)
-    trailing("trajectory", "x0", x0, dims=2, last=getattr(system, "dim", None), meta=False, vmap=False)
+    trailing("trajectory", "x0", x0, dims=2, last=getattr(system, "dim", None), vmap=False)
     positive_real("trajectory", "dt", dt)
     total = integer("trajectory", "steps", steps, least=0) + 1
     size = total if chunk is None else integer("trajectory", "chunk", chunk, least=1)
@@ -81,7 +81,8 @@ def trajectory(
     for start in range(0, total, size):
         stop = min(start + size, total)
         if flow is not None:
-            time = torch.arange(start, stop, dtype=torch.float64, device="cpu") * dt
+            where = "meta" if x0.is_meta else "cpu"
+            time = torch.arange(start, stop, dtype=torch.float64, device=where) * dt
             exact = over_rows(functools.partial(flow, time=time), x0)
             if exact is not None:
                 yield exact

@@ -75,7 +75,7 @@ def _rows(name: str, matrix: object, rule: str) -> Sequence[Sequence[float]]:
 
 
 def _stack(name: str, matrix: object, rule: str) -> Tensor:
-    if isinstance(matrix, RowNumbers):
+    if isinstance(matrix, RowNumbers) or (isinstance(matrix, Tensor) and matrix.is_meta):
         if matrix.dim() != 2 or (name == "matrix" and len(matrix) != matrix.shape[1]):
             raise fail("Linear", name, rule, tuple(matrix.shape))
         number("Linear", name, matrix)

@@ -37,7 +37,7 @@ def test_numbers_of_any_kind_are_samples(value: Any) -> None:
     assert isinstance(model.predict(value), torch.Tensor if isinstance(value, torch.Tensor) else np.ndarray)
     assert model.predict(torch.ones(2)).dtype == torch.float32  # the caller's, whatever the first sample had
     assert model.predict(np.ones(2)).dtype == np.float64
-    with pytest.raises(ValueError, match=r"predict\(x=...\)` must have numbers.*meta"):
+    with pytest.raises(ValueError, match=r"predict\(x=...\)` must be on cpu.*meta"):
         model.predict(torch.ones(2, device="meta"))
 
 

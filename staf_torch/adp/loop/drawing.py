@@ -33,8 +33,8 @@ def points_of_steps(x: Tensor, seeds: Sequence[int], first: int, count: int, dra
 def generated(x0: Tensor, count: int, draws: int, generators: Sequence[torch.Generator]) -> Tensor:
     """Return the next ``count`` steps' numbers, (B, count, draws, n), one generator of the CPU a row."""
     rows, dim = x0.shape
-    if not draws:
-        return x0.new_empty(rows, count, 0, dim)
+    if not draws or x0.is_meta:
+        return x0.new_empty(rows, count, draws, dim)
     drawn = torch.empty(rows, count, draws, dim, dtype=torch.float64, device="cpu")
     for row, generator in zip(drawn.unbind(0), generators, strict=False):
         row.uniform_(-1.0, 1.0, generator=generator)

@@ -128,6 +128,9 @@ def summary(result: LoopResult) -> str:
     who = "" if about is None else f"{about.plant} with {about.controller}, "
     states = Units().of_states(n) if about is None else about.units.of_states(n)
     inputs = Units().of_inputs(m) if about is None else about.units.of_inputs(m)
+    size = f"LoopResult: {who}{rows} {'row' if rows == 1 else 'rows'}, {len(result.time)} times, "
+    if result.state.is_meta:
+        return f"{size}{n} states, {m} inputs, on the meta device"
     bounded = ""
     limits = None if about is None else about.limits()
     if limits is not None and limits.low is not None and limits.high is not None:
@@ -142,8 +145,7 @@ def summary(result: LoopResult) -> str:
     )
     return "\n".join(
         [
-            f"LoopResult: {who}{rows} {'row' if rows == 1 else 'rows'}, {len(result.time)} times, "
-            f"0 to {float(result.time[-1]):g} s",
+            f"{size}0 to {float(result.time[-1]):g} s",
             f"  state    {_ranges('x', result.state, states)}",
             f"  control  {_ranges('u', result.control, inputs)}{bounded}",
             f"  cost     {f'{float(cost[0]):.4g}' if rows == 1 else spread}",

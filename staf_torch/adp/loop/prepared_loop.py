@@ -7,6 +7,7 @@ changed since (`Contents`) is that of the second time, if nothing had to be said
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 from collections.abc import Hashable
@@ -24,6 +25,7 @@ from ...lanes.gradients import wants_gradient
 from ...lanes.row_decisions import decided
 from ...lanes.row_numbers import anybodys, over_rows
 from ...numerics.checks import fail, positive_real, trailing
+from ...numerics.default_device import without_numbers
 from ...numerics.exponential_step import TOLERANCE
 from ...numerics.row_checks import is_ours
 from ...systems import ControlAffineSystem, Plant
@@ -194,6 +196,7 @@ def prepared(
     if learned and loop.holding.table is not None and wants_gradient(system, cost):
         rule = "must be given where the plant or its cost requires a gradient"
         raise fail("simulate", "substeps", rule, substeps)
+    loop = copy.deepcopy(loop) if x0.is_meta else loop  # whose parts keep their numbers
     loop.to(x0.device)
     for basis in (part for part in loop.modules() if isinstance(part, StaFBasis)):
         basis.check_learned()
@@ -211,7 +214,7 @@ def _forget(kept: dict[Hashable, Any]) -> None:
 
 def _check(system: Plant, cost: Cost, x0: Tensor) -> tuple[Cost, bool]:
     """Return the cost around the plant, once all shapes are right, and whether nothing had to be said."""
-    trailing("simulate", "x0", x0, dims=2, last=system.dim, meta=False, vmap=False)
+    trailing("simulate", "x0", x0, dims=2, last=system.dim, vmap=False)
     if x0.dim() != 2 or x0.shape[0] == 0:
         raise ValueError(f"`simulate(x0=...)` must have the shape (B, n); got {tuple(x0.shape)}.")
     name, size, inputs = type(system).__name__, x0.shape[1], cost.inputs
@@ -228,6 +231,8 @@ def _check(system: Plant, cost: Cost, x0: Tensor) -> tuple[Cost, bool]:
             )
     check_problem(system, cost)
     placed, silent = cost.around(system), list[bool]()
+    if without_numbers(system, cost):
+        return placed, False
     decided(lambda: silent.append(warn_if_restless("simulate", system, placed)), _ROWS)
     return placed, all(silent)
 

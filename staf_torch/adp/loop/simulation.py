@@ -183,6 +183,8 @@ class _LoopRun:
         loop, settings = ready.loop, ready.settings
         with torch.set_grad_enabled(learned):
             result, last = self.of(loop, ready.traits, ready.program)
+        if self.x0.is_meta:  # nobody can tell whether a row needs more steps
+            return result
         with torch.no_grad():
             seen = result.state[:, :: max(1, result.state.shape[1] // _SEEN)]
             reach = beside_history(wrap(seen, loop.system.periodic).abs().amax(-1).amax(-1), last.bent)
@@ -211,7 +213,8 @@ class _LoopRun:
         chosen = worth(pays, None if costly else self.x0) if self.compile == "auto" else bool(self.compile)
         compiled = chosen and loop.system.traceable
         found = program(loop, compiled) if make is None else make(compiled)
-        ran = _beginning(loop, found, self.steps) if not compiled and undecided(self.compile) else found
+        begins = not compiled and undecided(self.compile, self.x0)
+        ran = _beginning(loop, found, self.steps) if begins else found
         counted = self.progress is None and ran is found  # a `LoopProgram` counts its steps itself
         with Sign("adp.simulate", self.steps if counted else 0) as sign:
             tell = self.progress or sign.advance
@@ -278,8 +281,8 @@ def _run(
     row = {"seed": seed_parts(seeds, x0)} if draws and not old else {}
     generators = [torch.Generator().manual_seed(seed) for seed in (seeds if old else ())]
     draws = draws if old else 0  # ahead of the loop; others are drawn in it
-    ahead = _DRAWN_AHEAD
-    if draws or x0.is_cpu:  # elsewhere a piece is a kernel, which nobody waits for
+    ahead = steps if x0.is_meta else _DRAWN_AHEAD
+    if not x0.is_meta and (draws or x0.is_cpu):  # elsewhere a piece is a kernel, which nobody waits for
         ahead = max(1, min(ahead, _NUMBERS // (x0.numel() * max(draws, 1))))
     while done < steps:
         # A piece ends at a recorded time, or there is none inside.

@@ -22,7 +22,7 @@ from ...numerics.checks import (
     real,
     trailing,
 )
-from ...numerics.default_device import beside, device_of
+from ...numerics.default_device import beside, device_of, without_numbers
 from ...numerics.linalg import Matrix, positive_definite, positive_semidefinite, square
 from ...numerics.repr_text import limits, shown, sizes
 from ...numerics.row_checks import check_rows
@@ -149,19 +149,9 @@ class Cost(nn.Module, metaclass=OfRows):
                 f"`{type(self).__name__}` is for {self.dim} states and {self.inputs} inputs; "
                 f"{name} has {plant.dim} and {plant.inputs}."
             )
-        if self.target is None:
-            x = plant.equilibrium()
-            u = plant.resting_input() if self.target_input is None else self.target_input
-        else:
-            x = self.target
-            u = resting_input_at(plant, x) if self.target_input is None else self.target_input
-        if in_any_row(~torch.isfinite(u)):
-            u = torch.where(torch.isfinite(u).all(), u, plant.resting_input())
         placed = copied(self)
-        # An origin that the plant does not take by itself is kept: `around` may be asked again.
-        stated = self.target is not None and in_any_row(plant.equilibrium() != 0)
-        placed.target = x if stated or in_any_row(x != 0) else None
-        placed.target_input = u if in_any_row(u != 0) else None
+        if not without_numbers(self, plant):  # of which nobody can tell where it rests
+            placed.target, placed.target_input = self._rest(plant)
         placed.periodic = plant.periodic
         if self.output is not None and self.periodic != plant.periodic:
             placed._periods = periods_of(self.output, self.dim, plant.periodic)
@@ -173,6 +163,20 @@ class Cost(nn.Module, metaclass=OfRows):
             return self
         placed._prepare()
         return placed
+
+    def _rest(self, plant: Plant) -> tuple[Tensor | None, Tensor | None]:
+        """The state and the input from which this cost around a plant is measured, None for zeros."""
+        if self.target is None:
+            x = plant.equilibrium()
+            u = plant.resting_input() if self.target_input is None else self.target_input
+        else:
+            x = self.target
+            u = resting_input_at(plant, x) if self.target_input is None else self.target_input
+        if in_any_row(~torch.isfinite(u)):
+            u = torch.where(torch.isfinite(u).all(), u, plant.resting_input())
+        # An origin that the plant does not take by itself is kept: `around` may be asked again.
+        stated = self.target is not None and in_any_row(plant.equilibrium() != 0)
+        return x if stated or in_any_row(x != 0) else None, u if in_any_row(u != 0) else None
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """Move the bounds and the set-point, too: no step of a loop should copy them to its device."""
@@ -324,7 +328,7 @@ class QuadraticCost(Cost):
     """
 
     def _prepare(self) -> None:
-        self._coupled = in_any_row(self.r != torch.diag(self.r.diagonal()))
+        self._coupled = not self.r.is_meta and in_any_row(self.r != torch.diag(self.r.diagonal()))
         if self.bounds is None or not self._coupled:
             return
         if self.inputs > LARGEST:

@@ -17,7 +17,7 @@ from ...lanes.row_decisions import is_of_rows
 from ...lanes.row_numbers import nonzero
 from ...lanes.row_objects import made_by_rows
 from ...numerics.checks import integer, positive_real
-from ...numerics.default_device import device_of
+from ...numerics.default_device import device_of, without_numbers
 from ...numerics.exponential_step import (
     GRACE,
     MOST,
@@ -112,7 +112,7 @@ class Holding:
         self.error: float | None = None
         if plant.period is not None:
             self.least = self.steps = periods(call, plant, dt)
-        elif substeps is None:
+        elif substeps is None and not without_numbers(plant, cost):
             with untraced(), torch.no_grad():  # a filter may ask for it in its first step
                 self._choose_for_rows(exponential)
 

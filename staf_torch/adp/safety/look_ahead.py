@@ -101,7 +101,7 @@ class LookAhead(nn.Module):
     def asked(self, x: Tensor, u: Tensor, t: Tensor, strain: Tensor) -> Tensor:
         """The rows whose brakes may not do: (B, n), (B, m), (B,), (B,) -> (B,) bool."""
         of = self.conditions
-        second = torch.tensor(of.degree, dtype=torch.int64, device=x.device) == 2
+        second = torch.as_tensor(of.degree, dtype=torch.int64, device=x.device) == 2
 
         def urgent(given: tuple[Tensor, ...]) -> Tensor:
             x, u, t = given
@@ -149,7 +149,7 @@ class LookAhead(nn.Module):
     def hardest(self, lean: Lean) -> Tensor:
         """The control that brakes as hard as can be, for what is most urgent: (B, m)."""
         of, like = self.conditions, lean.value
-        second = torch.tensor(of.degree, dtype=torch.int64, device=like.device) == 2
+        second = torch.as_tensor(of.degree, dtype=torch.int64, device=like.device) == 2
         room = torch.where(lean.value > _ROUNDED, lean.value, _ROUNDED)
         able = torch.where(lean.ability > _ROUNDED, lean.ability, _ROUNDED)
         away = torch.where(lean.drift < 0, -lean.drift, 0.0)
@@ -198,8 +198,8 @@ class LookAhead(nn.Module):
     def _braked(self, x: Tensor, t: Tensor, strength: Tensor) -> Tensor:
         """The smallest h - margin under the hardest brake until nothing comes nearer: (B, k)."""
         of = self.conditions
-        second = torch.tensor(of.degree, dtype=torch.int64, device=x.device) == 2
-        weak = torch.tensor(of.weak, dtype=torch.bool, device=x.device)
+        second = torch.as_tensor(of.degree, dtype=torch.int64, device=x.device) == 2
+        weak = torch.as_tensor(of.weak, dtype=torch.bool, device=x.device)
         if of.frail is not None:
             weak = of.frail > 0
         value, rate, _ = of.every(of.level, x, t)

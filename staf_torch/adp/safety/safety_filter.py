@@ -283,8 +283,8 @@ class SafetyFilter(Controller, DecidedByRows):
             ValueError: if a constraint depends on the time, which is missing, or a shape is wrong.
         """
         plant = self.plant
-        trailing("SafetyFilter", "x", x, 1, plant.dim, meta=False)
-        trailing("SafetyFilter", "u", u, 1, plant.inputs, meta=False)
+        trailing("SafetyFilter", "x", x, 1, plant.dim)
+        trailing("SafetyFilter", "u", u, 1, plant.inputs)
         if t is None and self.moving:
             raise fail("SafetyFilter", "t", "must be given: a constraint depends on the time", t)
         time = torch.as_tensor(0.0 if t is None else t, device=x.device).to(x).expand(x.shape[:-1])
@@ -441,7 +441,7 @@ class SafetyFilter(Controller, DecidedByRows):
         """Return what u lacks to win so much of h within the hold, more than `INFEASIBLE`."""
         x, t, short = given
         lean = Lean(*self.conditions.every(self.conditions.lean, x, t))
-        second = torch.tensor(self.degree, dtype=torch.int64, device=x.device) == 2
+        second = torch.as_tensor(self.degree, dtype=torch.int64, device=x.device) == 2
         effect = (lean.slope * self.unit.to(x)).square().sum(-1).sqrt()
         effect = torch.where(second, 0.5 * self.hold * effect, effect).amax(-1) * self.hold
         further = short / torch.where(effect > 0, effect, 1.0)

@@ -121,9 +121,12 @@ def captured() -> Iterator[list[Callable[[], None]]]:
 
 
 def capturing(x: Tensor) -> bool:
-    """Return whether what is done with a tensor is recorded for a graph, where no number can be read."""
+    """Return whether no number of a tensor can be read, as what is done with it is recorded for a graph; on
+    the meta device there is none."""
     if x.is_cuda:
         return torch.cuda.is_current_stream_capturing()
+    if x.is_meta:
+        return True
     return x.is_cpu and _launches is not None
 
 

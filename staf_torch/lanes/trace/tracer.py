@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import functools
 import math
+import re
 import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -50,12 +51,22 @@ class NotLoweredError(Exception):
         super().__init__(f"{reason}{_where(traceback.extract_stack())}{'; ' + instead if instead else ''}")
 
 
-def explained(error: RuntimeError) -> Exception:
-    """Return the error of NumPy that asks for numbers while torch takes derivatives as a sentence that names
-    the line of code; another error as it is."""
+def explained(error: RuntimeError, call: str) -> Exception:
+    """Return the error of who asks for numbers where there are none as a sentence that names the line of
+    code: of NumPy while torch takes derivatives, and on the meta device; another error as it is.
+
+    Args:
+        error: of torch.
+        call: the function that met it.
+    """
+    where = _where(traceback.extract_tb(error.__traceback__))
+    if re.search(r"\bmeta (tensor|device)|Meta", str(error)):
+        return ValueError(
+            f"`{call.removesuffix('.__init__')}` must have numbers, which decide{where}, and the meta device "
+            f'has none: compute on the CPU, and move what is made there by `.to("meta")` ({error}).'
+        )
     if "data pointer of Tensor that doesn't have storage" not in str(error):
         return error
-    where = _where(traceback.extract_tb(error.__traceback__))
     return ValueError(
         f"numbers leave torch{where}, in a function of which derivatives are taken; {instead_of('numpy')} "
         f"({error})."

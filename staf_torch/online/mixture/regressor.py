@@ -16,7 +16,7 @@ from torch import Tensor
 from ...centers import simplex
 from ...kernels import GaussianKernel
 from ...lanes.compiler import compiled
-from ...numerics.checks import flag, integer, positive_real
+from ...numerics.checks import flag, integer, positive_real, trailing
 from ..compiled_filter import NATIVE, FunctionPointers
 from ..estimator import StreamEstimator
 from ..filter_streams import refuse_other, table_of
@@ -286,6 +286,7 @@ class MixtureRegressor(StreamEstimator):
         return self
 
     def _begin(self, streams: int, outputs: int, like: Tensor) -> Bank:
+        trailing(_NAME, "x", like, 1, meta=False)
         memory = integer(_NAME, "memory", self.memory, least=2 * RECENT)
         neighbours = integer(_NAME, "neighbours", self.neighbours, least=8)
         robust = None if self.robust is None else positive_real(_NAME, "robust", self.robust)
