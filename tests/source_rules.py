@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import ast
+import inspect
 import re
 from collections.abc import Iterator, Sequence
 
+from torch import nn
+
 _MAKERS = ("zeros", "ones", "full", "empty", "eye", "linspace", "logspace", "rand", "randn", "tensor")
-_ANYWHERE = {*_MAKERS, "arange", "as_tensor", "empty_strided", "randint", "randperm", "scalar_tensor"}
-_ANYWHERE |= {"tril_indices", "triu_indices"}
+_ANYWHERE = {*_MAKERS, "arange", "as_tensor", "asarray", "empty_permuted", "empty_quantized", "empty_strided"}
+_ANYWHERE |= {"fftfreq", "nested_tensor", "randint", "randperm", "range", "rfftfreq", "scalar_tensor"}
+_ANYWHERE |= {"tril_indices", "triu_indices", "sparse_compressed_tensor", "sparse_coo_tensor"}
+_ANYWHERE |= {f"sparse_{k}_tensor" for k in ("bsc", "bsr", "csc", "csr")}
+_ANYWHERE |= {f"{k}_window" for k in ("bartlett", "blackman", "hamming", "hann", "kaiser")}
+"""All that `torch.set_default_device` changes."""
 _CASTS = ("double", "to", "long", "type_as")
 _TEXT = ("read_text", "write_text")
 _DOCUMENTED = {"_asdict", "_field_defaults", "_fields", "_make", "_replace", "_exit"}
@@ -37,16 +44,24 @@ def without_dtype(nodes: Sequence[ast.AST]) -> Iterator[str]:
 
 
 def without_device(nodes: Sequence[ast.AST]) -> Iterator[str]:
-    """Calls that make a tensor on torch's default device, which is the user's: by line."""
+    """Calls that make a tensor, or a layer's parameters, on torch's default device, which is the user's: by
+    line. So may whoever gets such a function under another name."""
+    calls = {id(node.func): node for node in nodes if isinstance(node, ast.Call)}
     for node in nodes:
-        if (
-            isinstance(node, ast.Call)
-            and isinstance(node.func, ast.Attribute)
-            and node.func.attr in _ANYWHERE
-            and ast.unparse(node.func.value) == "torch"
-            and not any(word.arg in ("device", "out", None) for word in node.keywords)
-        ):
-            yield f"{node.lineno}: {ast.unparse(node)[:80]}"
+        if isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == "torch":
+            yield from (f"{node.lineno}: imports {each.name}" for each in node.names if _makes(each.name))
+        elif isinstance(node, ast.Attribute) and _makes(node.attr) and _plain_root(node) in ("torch", "nn"):
+            call = calls.get(id(node))
+            if call is None or not any(word.arg in ("device", "out") for word in call.keywords):
+                yield f"{node.lineno}: {ast.unparse(node if call is None else call)[:80]}"
+
+
+def _makes(name: str) -> bool:
+    """Whether a function of torch, or a layer, makes tensors on the default device."""
+    layer = getattr(nn, name, None)
+    return name in _ANYWHERE or (
+        isinstance(layer, type) and "device" in inspect.signature(layer.__init__).parameters
+    )
 
 
 def without_encoding(nodes: Sequence[ast.AST]) -> Iterator[str]:

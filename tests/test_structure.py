@@ -229,6 +229,33 @@ def test_no_number_depends_on_torchs_default_dtype_or_device_and_no_text_on_a_lo
     assert [line for name in MODULES for line in about(name).told] == []
 
 
+ON_THE_DEFAULT_DEVICE = """
+torch.zeros(3)
+torch.fft.fftfreq(3)
+torch.as_tensor([1.0], dtype=torch.float64)
+torch.asarray([1.0])
+torch.sparse_coo_tensor(size=(2, 2))
+torch.zeros(3, **more)
+make = torch.zeros
+map(torch.tensor, numbers)
+from torch import zeros
+nn.Linear(2, 1)
+torch.nn.Linear(2, 1, dtype=torch.float64)
+""".strip().splitlines()
+BESIDE_OTHERS = """
+torch.zeros(3, device=x.device); torch.zeros_like(x); x.new_zeros(3); torch.sin(x); np.zeros(3)
+nn.Linear(2, 1, device="cpu"); nn.Parameter(x); nn.Sequential(layer); torch.from_numpy(array)
+"""
+
+
+def test_what_makes_tensors_on_the_default_device_is_found_and_what_names_another_is_not() -> None:
+    def found(lines: str) -> list[str]:
+        return [*without_device([*ast.walk(ast.parse(lines))])]
+
+    assert [line for line in ON_THE_DEFAULT_DEVICE if not found(line)] == []
+    assert found(BESIDE_OTHERS) == []
+
+
 def test_no_test_looks_inside_the_package() -> None:
     """Public names only: what cannot be seen through them no user loses."""
     files = [path for path in TESTS.rglob("*.py") if str(path.relative_to(TESTS)) not in INSIDE]

@@ -178,10 +178,10 @@ class DeviceCall:
         given = [leaf.tensor if type(leaf) is Shared else leaf for leaf in self._with_columns(leaves)]
         for k in self._copied:
             given[k] = given[k].to(self._where).contiguous()
-        where, empty = self._where, torch.empty_strided
+        where = self._where
         try:
             rooms: list[Any] = [
-                None if room is None else empty(room[0], room[1], dtype=room[2], device=where)
+                None if room is None else torch.empty_strided(*room[:2], dtype=room[2], device=where)
                 for room in self._rooms
             ]
         except RuntimeError as error:  # of an earlier kernel, too, which is told as it is
