@@ -16,6 +16,8 @@ from staf_torch.targets import Cosine, Paper
 
 BATCHES = ((), (2, 3))
 STEP = 1e-5
+# A radius that stays and one that follows the state, with every kernel.
+TWO_RADII_EACH = [(name, radius) for k, name in enumerate(KERNELS) for radius in [*RADII][k % 2 :: 2]]
 
 
 def fitted(kernel: str, batch: tuple[int, ...] = (), radius: object = 0.5) -> st.StaF:
@@ -37,8 +39,7 @@ def test_fit_interpolates_the_target_at_the_centers(name: str, batch: tuple[int,
     torch.testing.assert_close(staf(centers), Paper()(centers), rtol=1e-9, atol=1e-9)
 
 
-@over(KERNELS)
-@over(RADII, "radius")
+@pytest.mark.parametrize(("name", "radius"), TWO_RADII_EACH)
 def test_estimate_is_the_weighted_sum_of_the_kernels(name: str, radius: str) -> None:
     staf = fitted(name, (4,), RADII[radius][0]())
     y = staf.state.unsqueeze(-2) + uniform(4, 5, 2, low=-0.2, high=0.2)
@@ -62,8 +63,7 @@ def test_partial_gradient_is_that_of_the_estimate_with_the_centers_frozen(
     assert torch.equal(gradient, staf.gradient(y, mode="partial"))
 
 
-@over(KERNELS)
-@over(RADII, "radius")
+@pytest.mark.parametrize(("name", "radius"), TWO_RADII_EACH)
 def test_total_gradient_with_frozen_weights_moves_the_centers_with_the_point(name: str, radius: str) -> None:
     staf = fitted(name, radius=0.3 if radius == "number" else RADII[radius][0]())
     y = staf.state + uniform(3, 2, low=-0.1, high=0.1)
@@ -152,8 +152,7 @@ def test_a_module_that_does_not_learn_or_is_asked_to_begins_at_zero() -> None:
         st.StaF(basis_of("gaussian"), init="ones")
 
 
-@over(KERNELS)
-@over(RADII, "radius")
+@pytest.mark.parametrize(("name", "radius"), TWO_RADII_EACH)
 def test_a_layer_begins_near_linear_functions_of_the_size_of_a_linear_layer(name: str, radius: str) -> None:
     staf = st.StaF(basis_of(name, 6, RADII[radius][0]()), (3,), 40)
     ball = staf.basis.centers(staf.state[0])

@@ -214,7 +214,7 @@ LOOPS = {
     ),
     "bases": ([], ["centers.shrink.gain=1,1.5", "adp.half_width=0.5,0.6"]),
     "behind walls": (
-        ["adp/policy=lqr", "system=pendulum", "adp.walls.high=[1.0,null]", "duration=0.03", *SHORT_LOOP],
+        ["adp/policy=lqr", "system=pendulum", "adp.walls.high=[1.0,null]", "duration=0.015", *SHORT_LOOP],
         ["system.mass=0.5,2"],
     ),
     "single precision": (["dtype=float32"], ["adp.gains.information=1,2"]),
