@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 _WORTH = 10  # operations of a step for each byte of its carry: kept, it costs less than the step again
 Plan = PlannedCall | DeviceCall
+Choice = tuple[frozenset[int] | None, frozenset[int] | None]
 _PATIENCE = 8  # calls that write carries for a gradient for which nobody asks, before others do without
 _PLANS = 64  # calls of other shapes that are remembered
 _MEBIBYTE = 2**20
@@ -125,7 +126,9 @@ class GradientCall:
         self._plans: dict[Any, tuple[Compiled, Plan]] = {}
         self.followers: dict[Hashable, tuple[Program, tuple[Hashable, Any], Any]] = {}
         self._keepers: dict[Where, tuple[Program, Hashable]] = {}  # programs, and where what is built stands
+        self._choices: dict[Hashable, Choice] = {}
         self._keepings: dict[Hashable, Keeping] = {}
+        self._place: tuple[Where, Hashable] = False, None  # of the program that keeps nothing
         self._refused, self._unasked = False, 0  # calls since a gradient was asked for
         self.adjoints = program.adjoints
 
@@ -178,23 +181,30 @@ class GradientCall:
             budget=_budget,
         )
 
-    def _keeps(self, where: Where, built: Built) -> tuple[frozenset[int] | None, frozenset[int] | None]:
+    def _keeps(self, where: Where, built: Built) -> Choice:
         """Return `Ran.keeps` and `Ran.written`."""
-        compiled, trace, needed = built.compiled, built.trace, frozenset(range(self.sizes[2]))
-        known: Any = self.adjoints.get(id(trace))
-        there = frozenset[int]()
+        trace, known = built.trace, self.adjoints.get(id(built.trace))
+        key = id(trace), where, _budget, None if known is None else len(known[1])  # which only grows
+        if key not in self._choices:
+            self._choices[key] = self._chosen(where, built, None if known is None else frozenset(known[1]))
+        keeps, written = self._choices[key]
+        if where is True and keeps and written and self._unasked >= _PATIENCE:
+            return keeps - written, None
+        return keeps, written
+
+    def _chosen(self, where: Where, built: Built, known: frozenset[int] | None) -> Choice:
+        """Return what is worth keeping of the leaves that adjoints read, as far as that is known."""
+        compiled, needed, there = built.compiled, frozenset(range(self.sizes[2])), frozenset[int]()
         if where is True:
-            needed = needed if known is None else frozenset(known[1])
-            there = needed & in_results(trace, len(compiled.outputs) - self.sizes[2])
+            needed = needed if known is None else known
+            there = needed & in_results(built.trace, len(compiled.outputs) - self.sizes[2])
         written = needed - there
         size = sum(compiled.carry[k][0].numel() for k in written) * compiled.real.itemsize
-        work = _work(trace.text.source)
+        work = _work(built.trace.text.source)
         pays = work is None or work > _WORTH * size
         if self.every > 1 or not pays or size * self.rows * self.times > _budget:
             return None, None
-        if where is True and (known is None or (written and self._unasked >= _PATIENCE)):
-            return there, None
-        return needed, written
+        return (there, None) if where is True and known is None else (needed, written)
 
     def given(self, tensors: Sequence[Tensor]) -> Given:
         """Return the inputs of the program, of flat ones."""
@@ -286,7 +296,7 @@ class GradientCall:
         self._unasked += 1
         keeping, end = ran.built, len(ran.built.compiled.outputs)  # carries and outputs, before carries
         nothing = ran.keeps is None or (ran.written is not None and not ran.written)
-        built = (self.program.built(given) if nothing else None) or keeping
+        built = (self._plain(given, ran.where) if nothing else None) or keeping
         if ran.keeps is None or ran.where is not True:
             rooms = self.run(ran.where, built, given, own, self.every)
             return rooms[:end], [] if ran.keeps is None else rooms[end:], []
@@ -300,6 +310,13 @@ class GradientCall:
         dtypes = [dtype for _, dtype in (*compiled.carry, *compiled.outputs)]
         found = [room.to(dtype) for room, dtype in zip(made.results, dtypes, strict=False)]
         return found, made.before, made.watched
+
+    def _plain(self, given: Given, where: Where) -> Built | None:
+        """Return the program that puts out nothing but results, None where there is none."""
+        built = self.program.latest(self._place[1]) if self._place[0] == where else None
+        if built is None:
+            built, self._place = self.program.built(given), (where, self.program.place(given))
+        return built
 
     def backward(
         self,
