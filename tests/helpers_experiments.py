@@ -21,12 +21,12 @@ from staf_torch.results.progress import Progress
 CASES: dict[str, str] = {
     "adp": "experiment=adp duration=0.3 dt=0.005 trajectories=2",
     "adp_comparison": "experiment=adp_comparison duration=0.04 dt=0.01 trajectories=20",
-    "adp_initial_weights": "experiment=adp_initial_weights duration=0.5 dt=0.02 trajectories=5 "
+    "adp_initial_weights": "experiment=adp_initial_weights duration=0.3 dt=0.02 trajectories=5 "
     "initial_weights=[0.1,1.0]",
     "adp_tracking": "experiment=adp_tracking duration=0.3 dt=0.01",
     "avoidance": "experiment=avoidance trajectories=3 duration=2.0 dt=0.2 adp.compile=false",
     "avoidance of a unicycle": "experiment=avoidance avoidance.vehicle=unicycle avoidance.discs=2 "
-    "trajectories=6 duration=4.0 dt=0.2 adp.compile=false",
+    "trajectories=3 duration=3.0 dt=0.2 adp.compile=false",
     "exponential_bound": "experiment=exponential_bound exponential_bound.states=9 "
     "exponential_bound.radii=[0.1]",
     "faults": "experiment=faults trajectories=3 duration=0.6 faults.cases=[unstable]",

@@ -139,13 +139,16 @@ def test_a_design_of_a_device_is_that_of_the_cpu() -> None:
     )
 
 
-@pytest.mark.parametrize("name", ["gradient_chase", "faults", "icl"])
-def test_an_experiment_runs_on_a_device_with_the_numbers_of_the_cpu(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("name", "duration"), [("gradient_chase", 1.0), ("faults", 0.2), ("icl", 0.15)])
+def test_an_experiment_runs_on_a_device_with_the_numbers_of_the_cpu(
+    name: str, duration: float, tmp_path: Path
+) -> None:
     folders = [tmp_path / "here", tmp_path / "there"]
     for folder in folders:
         folder.mkdir()
-    wanted = run(folders[0], *words(name), "figures=false", "history=false").metrics
-    found = run(folders[1], *words(name), "figures=false", f"device={DEVICE.type}").metrics
+    line = [*words(name), f"duration={duration}", "figures=false"]
+    wanted = run(folders[0], *line, "history=false").metrics
+    found = run(folders[1], *line, f"device={DEVICE.type}").metrics
     assert found == {
         key: None if number is None else pytest.approx(number, rel=1e-6, abs=1e-9)
         for key, number in wanted.items()

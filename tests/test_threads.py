@@ -27,7 +27,7 @@ LEARNERS = {
 
 @over(OBJECTS, "name")
 def test_four_threads_get_the_bits_of_one_and_ask_beside_others_that_learn(name: str) -> None:
-    crowd(OBJECTS[name], 24)
+    crowd(OBJECTS[name], 24 if OBJECTS[name].learn else 8)
 
 
 @over(LEARNERS, "kind")

@@ -1,6 +1,6 @@
 """Every experiment, run short, has its golden metrics, its files and its figures.
 
-    python tests/experiments/test_reference_metrics.py [CASE ...]  # records the golden metrics anew; minutes
+    PYTHONPATH=tests python tests/experiments/test_reference_metrics.py [CASE ...]  # records them anew
 
 A golden metric is one of `GOLDEN` that moves by less than 1e-7 of itself while the initial state moves by
 1e-12 of itself and while torch and compiled loops use AVX-512, AVX2 or neither; what moves more is bounded

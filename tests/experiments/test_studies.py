@@ -251,7 +251,7 @@ def test_behind_the_filter_a_unicycle_keeps_off_the_discs_that_its_policy_drives
     assert metrics["minimum_margin"] > 0 > metrics["lookahead_minimum_margin"]
     assert [row["method"] for row in result.rows("avoidance")] == ["lookahead, filtered", "lookahead"]
     with np.load(result.directory / "history.npz") as history:
-        assert history["state"].shape == (6, 21, 11)
+        assert history["state"].shape == (3, 16, 11)
         assert float(history["distance"].min()) == pytest.approx(metrics["minimum_margin"])
         assert float(history["lookahead_distance"].min()) == pytest.approx(
             metrics["lookahead_minimum_margin"]

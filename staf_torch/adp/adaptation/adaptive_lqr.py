@@ -62,7 +62,7 @@ class AdaptiveLQR(Controller):
         >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
         >>> law = adp.LeastSquares([0.3, 0.6], deviation=[0.3, 0.5])
         >>> control = adp.AdaptiveLQR(plant, cost, adp.IntegralWindows(plant, 0.05), law)
-        >>> run = adp.simulate(control, plant, cost, torch.tensor([[0.5, 0.0]]).double(), dt=0.02, steps=150)
+        >>> run = adp.simulate(control, plant, cost, torch.tensor([[0.5, 0.0]]).double(), dt=0.02, steps=75)
         >>> run["theta"][0, -1].round(decimals=2)
         tensor([0.1000, 1.0000], dtype=torch.float64)
 

@@ -244,7 +244,7 @@ class Observed(Controller):
         >>> inside = adp.Observed(adp.Feedback(adp.LQR(plant, cost)), filter, deviation=0.5)
         >>> outside = adp.Measured(inside, noise=0.01, dim=1, output=angle)
         >>> x0 = torch.tensor([[0.3, -0.2]]).double()
-        >>> run = adp.simulate(outside, plant, cost, x0, dt=0.02, steps=200)
+        >>> run = adp.simulate(outside, plant, cost, x0, dt=0.02, steps=100)
         >>> bool(run.state[0, -1].norm() < 0.1), bool(run.diverged)
         (True, False)
 
