@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
@@ -11,10 +11,17 @@ import torch
 from helpers import tensor
 from torch import Tensor
 
-from staf_torch import adp, systems
+from staf_torch import adp, lanes, systems
 
 KINK = systems.RatePlant(lambda x, u: u.abs(), dim=1, inputs=1)
 ONE = adp.QuadraticCost(1.0, 0.1, dim=1, inputs=1, low=-1.0, high=1.0)
+
+
+@pytest.fixture(autouse=True)
+def _nothing_is_compiled() -> Iterator[None]:
+    """Plans are short, and each is searched for once: a compiler takes longer."""
+    with lanes.compiling("never"):
+        yield
 
 
 class Unicycle(systems.ControlAffineSystem):
@@ -72,7 +79,9 @@ def test_a_rate_with_a_kink_at_rest_is_planned_as_its_smooth_half(caplog: pytest
     torch.testing.assert_close(costs[0], best.cost, rtol=1e-3, atol=0.0)
     assert (costs[1] <= 1.001 * best.cost).all()
     assert (costs[2] <= 1.5 * best.cost).all()
-    shot = adp.DirectShooting(KINK, ONE, horizon=1.4, terminal=0.0, intervals=14, iterations=30).solve(x0)
+    shot = adp.DirectShooting(
+        KINK, ONE, horizon=1.4, terminal=0.0, intervals=14, iterations=12, starts=2
+    ).solve(x0)
     assert (shot.value <= 1.01 * best.cost).all()
     assert all(reason.startswith("local") for reason in shot.reason)
 
@@ -80,9 +89,10 @@ def test_a_rate_with_a_kink_at_rest_is_planned_as_its_smooth_half(caplog: pytest
 def test_a_unicycle_parks_sideways() -> None:
     cost = adp.QuadraticCost([1.0, 1.0, 0.1], 0.1, dim=3, inputs=2, low=-1.0, high=1.0, terminal=5.0)
     x0 = tensor([[0.0, 0.4, 0.0]])
-    shot = adp.DirectShooting(Unicycle(), cost, horizon=1.4, intervals=10, iterations=30, starts=2).solve(x0)
+    shot = adp.DirectShooting(Unicycle(), cost, horizon=1.4, intervals=8, iterations=12, starts=1).solve(x0)
     still = 1.4 * 0.4**2 + 5 * 0.4**2  # what standing where it is costs
-    plan = adp.BoxDDP(adp.SampledProblem.of(Unicycle(), cost, dt=0.1), steps=14, compile=False).solve(x0)
+    problem = adp.SampledProblem.of(Unicycle(), cost, dt=0.1)
+    plan = adp.BoxDDP(problem, steps=14, iterations=12, compile=False).solve(x0)
     assert float(shot.value) < 0.6 * still
     torch.testing.assert_close(plan.cost, shot.value, rtol=0.02, atol=0.0)
 
@@ -102,7 +112,7 @@ def test_an_economic_cost_is_planned_from_everywhere_to_the_same_by_all() -> Non
     cost = Profit(1.0, 1.0, dim=1, inputs=1, low=0.0, high=2.0)
     x0 = tensor([[0.5], [0.0]])
     plan, *_ = three(plant, cost, x0, 12)
-    shot = adp.DirectShooting(plant, cost, horizon=1.2, intervals=12).solve(x0)
+    shot = adp.DirectShooting(plant, cost, horizon=1.2, intervals=8).solve(x0)
     assert shot.converged.all()
     assert (shot.value < -0.1).all()
     torch.testing.assert_close(plan, shot.value, rtol=0.01, atol=0.0)

@@ -66,10 +66,10 @@ def test_simulation_drives_it_as_a_controller() -> None:
     plant = systems.Pendulum()
     cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, low=-4.0, high=4.0)
     problem = adp.SampledProblem.of(plant, cost, dt=0.1)
-    mpc = adp.RecedingHorizon(problem, steps=10, iterations=2, compile=False)
+    mpc = adp.RecedingHorizon(problem, steps=6, iterations=2, compile=False)
     x0 = torch.tensor([[0.3, 0.0], [-0.2, 0.1]], dtype=torch.float64)
-    run = adp.simulate(mpc, plant, cost, x0, dt=0.1, steps=12, compile=False)
-    best = adp.BoxDDP(problem, steps=12, compile=False).solve(x0)
+    run = adp.simulate(mpc, plant, cost, x0, dt=0.1, steps=6, compile=False)
+    best = adp.BoxDDP(problem, steps=6, compile=False).solve(x0)
     torch.testing.assert_close(run.cost, best.cost - problem.terminal(best.state[:, -1]), rtol=1e-3, atol=0)
 
 

@@ -206,7 +206,7 @@ def test_in_barrier_coordinates_rollouts_move_the_distances_to_the_walls() -> No
     box = systems.Barrier(systems.TwoStateChain(), [-7.0, -5.0], [5.0, 7.0])
     cost = adp.QuadraticCost(10.0, 0.1, dim=2, inputs=1)
     s0 = box.transform(torch.tensor([[-6.5, 6.5]], dtype=torch.float64))
-    coarse, fine = (adp.RolloutPolicy.of_lqr(box, cost, steps=steps).rollout(s0) for steps in (10, 100))
+    coarse, fine = (adp.RolloutPolicy.of_lqr(box, cost, steps=steps).rollout(s0) for steps in (10, 50))
     torch.testing.assert_close(coarse, fine, rtol=0.05, atol=0)
     assert float(fine) == pytest.approx(70.78, rel=0.05)  # of the LQR of s, here 0.5 s of it and its value
 
@@ -214,7 +214,7 @@ def test_in_barrier_coordinates_rollouts_move_the_distances_to_the_walls() -> No
 def test_beside_a_wall_the_slope_of_a_rollout_policy_is_that_of_what_its_rollouts_cost() -> None:
     box = systems.Barrier(systems.TwoStateChain(), (-7, -5), (5, 7))
     cost = adp.QuadraticCost(10.0, 0.1, dim=2, inputs=1)
-    policy = adp.RolloutPolicy.of_lqr(box, cost, steps=60)
+    policy = adp.RolloutPolicy.of_lqr(box, cost, steps=30)
     s = box.transform(torch.tensor([-6.5, 6.5], dtype=torch.float64))
     apart = 0.01 * torch.eye(2, dtype=torch.float64)
     wanted = (policy.rollout(s + apart) - policy.rollout(s - apart)) / 0.02

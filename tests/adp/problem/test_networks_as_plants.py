@@ -63,22 +63,22 @@ def test_every_planner_takes_networks_and_refuses_the_backward_pass_to_them(
     plant: systems.Plant, cost: adp.Cost
 ) -> None:
     problem = adp.SampledProblem.of(plant, cost, dt=0.05, terminal=0.0)
-    plan = adp.BoxDDP(problem, steps=6, iterations=4, compile=False).solve(X0)
+    plan = adp.BoxDDP(problem, steps=4, iterations=4, compile=False).solve(X0)
     refuses(plan.cost, "BoxDDP.solve")
     with torch.no_grad():
-        again = adp.BoxDDP(problem, steps=6, iterations=4, compile=False).solve(X0)
+        again = adp.BoxDDP(problem, steps=4, iterations=4, compile=False).solve(X0)
     assert torch.equal(again.cost, plan.cost)
     assert not again.cost.requires_grad
     for planner in (
-        adp.RecedingHorizon(problem, steps=6, compile=False),
-        adp.PathIntegral(problem, steps=6, samples=10, knots=2, noise=0.5, compile=False),
+        adp.RecedingHorizon(problem, steps=4, compile=False),
+        adp.PathIntegral(problem, steps=4, samples=10, knots=2, noise=0.5, compile=False),
     ):
         run = adp.simulate(planner, plant, cost, X0, dt=0.05, steps=2, compile=False)
         assert torch.isfinite(run.cost).all()
         if isinstance(planner, adp.RecedingHorizon):
             refuses(run.cost, "RecedingHorizon.step")
     if plant.period is None:
-        shot = adp.DirectShooting(plant, cost, horizon=0.3, intervals=6, terminal=0.0).solve(X0)
+        shot = adp.DirectShooting(plant, cost, horizon=0.2, intervals=4, terminal=0.0).solve(X0)
         torch.testing.assert_close(shot.value, plan.cost, rtol=0.05, atol=1e-4)
         refuses(shot.control, "DirectShooting.solve")
 

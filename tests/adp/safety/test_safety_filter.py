@@ -71,8 +71,8 @@ def test_a_wall_is_never_crossed_and_a_larger_margin_keeps_farther_away() -> Non
     x0 = torch.stack((uniform(8, low=0.2, high=2.0, seed=4), uniform(8, low=-0.2, high=1.0, seed=5)), dim=-1)
     least = []
     for margin in (0.0, 0.05):
-        guard = adp.SafetyFilter(lambda x: 0 * x[..., :1] - 3, LINE, wall, dt=0.1, decay=4.0, margin=margin)
-        run = adp.simulate(guard, LINE, COST, x0, steps=10, compile=False)
+        guard = adp.SafetyFilter(lambda x: 0 * x[..., :1] - 3, LINE, wall, dt=0.2, decay=4.0, margin=margin)
+        run = adp.simulate(guard, LINE, COST, x0, steps=5, compile=False)
         report = guard.report(run)
         assert report["constraint_violations"] == 0
         assert report["infeasible"] == []
@@ -103,7 +103,7 @@ def test_discs_that_move_and_appear_are_avoided_within_the_bounds() -> None:
 def test_rows_that_cannot_be_kept_are_named() -> None:
     guard = adp.SafetyFilter(lambda x: -x[..., 1:], LINE, wall, dt=0.05, low=-1.0, high=1.0)
     x0 = tensor([[1.0, 0.0], [0.0, -2.0], [2.0, 0.0]])
-    run = adp.simulate(guard, LINE, COST, x0, steps=3, compile=False)
+    run = adp.simulate(guard, LINE, COST, x0, steps=2, compile=False)
     report = guard.report(run)
     assert report["infeasible"] == [1]
     assert report["constraint_violations"] == 1
