@@ -122,6 +122,12 @@ class Given(NamedTuple):
         floats = [plain(leaf).dtype for leaf in (*self.carry, *self.now, *self.row)]
         return torch.float64 if torch.float64 in floats or torch.float32 not in floats else torch.float32
 
+    @property
+    def formal(self) -> bool:
+        """Return whether there are times, and no numbers: on the meta device a step has the shapes of all."""
+        leaves = (*self.carry, *self.now, *self.row)
+        return self.times > 0 and any(plain(leaf).is_meta for leaf in leaves)
+
     def trees(self) -> Tree:
         """The trees (row, now, carry)."""
         return tuple(self.tree(name, getattr(self, name)) for name in ("row", "now", "carry"))

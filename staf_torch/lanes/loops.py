@@ -57,19 +57,19 @@ def repeat(
             carry = body(carry)
             continue
         going = where(carry)
-        if not _unread(going) and not bool(going.any()):
+        unseen = going.is_meta or tracing_now() or torch._C._functorch.peek_interpreter_stack()
+        if not unseen and not bool(going.any()):
             break
         carry = _chosen(going, body(carry), carry)
     return carry
 
 
 @contextmanager
-def few_passes() -> Iterator[None]:
-    """Loops in plain torch end after a few passes; a scan repeats the outputs of the last.
-
-    To try what a step does with its rows: a few passes call all that the loop calls.
-    """
-    before, _active.few = getattr(_active, "few", False), True
+def few_passes(asked: bool = True) -> Iterator[None]:
+    """Loops in plain torch end, if asked, after a few passes, which call all that the loop calls; a scan
+    repeats the outputs of the last."""
+    before = getattr(_active, "few", False)
+    _active.few = before or asked
     try:
         yield
     finally:
@@ -129,7 +129,7 @@ def where_rows(where: Tensor, body: Callable[[Tree], Some], given: Tree, otherwi
         start = otherwise, given
         chosen: Some = repeat(1, lambda now: (body(now[1]), now[1]), start, where=lambda _: where)[0]
         return chosen
-    if _unread(where):
+    if where.is_meta or tracing_now() or torch._C._functorch.peek_interpreter_stack():
         every: Some = _chosen(where, body(given), otherwise)
         return every
     rows = where.nonzero().squeeze(1)
@@ -269,11 +269,6 @@ def _reduced(values: Tensor, operation: str, dim: int) -> Tensor:
 def _unsqueezed(tree: Tree, dim: int) -> Tree:
     leaves, structure = flatten(tree)
     return unflatten(structure, iter([leaf.unsqueeze(dim) for leaf in leaves]))
-
-
-def _unread(mask: Tensor) -> bool:
-    """Return whether nobody may look which rows a mask has."""
-    return mask.is_meta or tracing_now() or torch._C._functorch.peek_interpreter_stack() is not None
 
 
 @contextmanager

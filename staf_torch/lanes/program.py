@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import operator
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any, TypeVar, cast
@@ -206,21 +205,18 @@ class Program(Derived):
 
     def _all_times(self, given: Given, carry: Tree, every: int) -> tuple[Tree, Tree]:
         fixed = given.tree("row", [plain(leaf) for leaf in given.row])
-        columns: list[list[Tensor]] = []
-        shape: Any = ("fixed", ())
-        formal = any(plain(leaf).is_meta for leaf in (*given.carry, *given.now, *given.row))
-        times = min(given.times, 1) if formal else given.times  # all steps have the shapes of the first
-        with alone(given.rows * ENTRIES), few_passes() if formal else contextlib.nullcontext():
-            for k in range(times):
+        columns, shape = list[list[Tensor]](), cast("Any", ("fixed", ()))
+        with alone(given.rows * ENTRIES), few_passes(formal := given.formal):
+            for k in range(1 if formal else given.times):
                 at = [leaf.tensor[k] if isinstance(leaf, Shared) else leaf[:, k] for leaf in given.now]
                 carry, out = self.step(carry, given.tree("now", at), fixed)
                 if k % every == 0:
                     parts, shape = flatten(out)
                     columns.append(parts)
         stacked = [torch.stack(column, dim=1) for column in zip(*columns, strict=True)]
-        if times < given.times:
-            recorded = -(-given.times // every)
-            stacked = [one.expand(-1, recorded, *one.shape[2:]).contiguous() for one in stacked]
+        if formal:
+            count = -(-given.times // every)
+            stacked = [one.expand(-1, count, *one.shape[2:]).contiguous() for one in stacked]
         return carry, unflatten(shape, iter(stacked))
 
     def compiles(self, carry: Tree, now: Tree = (), row: Tree = (), *, steps: int | None = None) -> bool:
