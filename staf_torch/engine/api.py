@@ -13,7 +13,7 @@ from torch import Tensor
 from ..approximation.basis import StaFBasis, Target
 from ..lanes import Program, Shared
 from ..lanes.device.chunks import beside_history, joined
-from ..lanes.opaque import opaque
+from ..lanes.opaque import one_operator
 from ..lanes.row_numbers import over_rows
 from ..lanes.short_calls import ShortCall
 from ..lanes.tree import plain
@@ -32,7 +32,7 @@ from .result import ChaseResult, ChaseWeights, concatenate
 _WORKING_BYTES = 2**26
 
 
-@opaque
+@one_operator
 @Sign("chase")
 def chase(
     states: Tensor,
@@ -120,7 +120,7 @@ def chase_pieces(
         yield run.results(states)
 
 
-@opaque
+@one_operator
 @Sign("chase_weights")
 def chase_weights(
     states: Tensor | Iterable[Tensor],

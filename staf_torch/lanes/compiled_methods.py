@@ -11,6 +11,7 @@ or differentiates. To compile at construction would take seconds of every short 
 from __future__ import annotations
 
 import contextlib
+import functools
 import math
 from collections.abc import Callable
 from types import CodeType, MethodType
@@ -18,7 +19,6 @@ from typing import Any, Protocol, overload
 
 import torch
 from torch import Tensor, nn
-from torch.compiler import is_exporting
 from torch.utils import _device
 
 from ..signs import Sign
@@ -26,10 +26,11 @@ from .call import at_once, ordinary
 from .call import served as served_by
 from .call_inputs import one_precision
 from .contents import BOUND, Contents
+from .graph_operator import NAMED, spelled
 from .locks import Mutex
 from .loops import tracing_now
 from .one_thread import ENTRIES, alone
-from .opaque import opaque
+from .opaque import one_operator
 from .plain_time import PlainTime
 from .program import Program
 from .row_functions import Rows, Trees, is_state
@@ -40,6 +41,7 @@ from .when_compiled import undecided, worth
 _PAYS = 100  # calls of a small batch in plain torch after which it is compiled, however short they are
 _SOON = 30  # calls
 _KEPT = 64  # shapes of calls that are remembered
+_is_exporting = getattr(torch.compiler, "is_exporting", torch.compiler.is_compiling)  # torch 2.6 has none
 
 
 class Served(Protocol):
@@ -86,6 +88,8 @@ class compiled:  # noqa: N801
 
     def __call__(self, definition: Callable[..., Tree]) -> compiled:
         self.definition, self.__doc__ = definition, definition.__doc__
+        self.in_graphs = f"{self!r} {len(NAMED)}"
+        NAMED[self.in_graphs] = self
         return self
 
     @overload
@@ -96,24 +100,44 @@ class compiled:  # noqa: N801
         if owner is None:
             return self
         bound = vars(owner).get(BOUND)
-        if bound is None:
-            bound = vars(owner).setdefault(BOUND, _Bound(owner))
-        if bound.owner is not owner:  # that of which the owner is a shallow copy
-            bound = vars(owner)[BOUND] = _Bound(owner)
+        if bound is None or bound.owner is not owner:
+            bound = bound_to(owner)
         method: CompiledMethod | None = bound.get(self)
         if method is None:
             method = bound.setdefault(self, CompiledMethod(MethodType(self.definition, owner), owner, self))
         return method
 
 
-class _Bound(dict[compiled, "CompiledMethod"]):
-    """The compiled methods of an object: none of a copy or of one that comes out of a pickle."""
+def _called_by(settings: compiled, owner: Any, *given: Any) -> Any:
+    """Call the method of an owner."""
+    return settings.__get__(owner, type(owner))(*given)
+
+
+def _got_in_graph(settings: compiled, owner: Any, _: type) -> Any:
+    """Return what `torch.compile` reads as the method of an owner."""
+    return settings if owner is None else functools.partial(_CALLED_BY, settings.in_graphs, owner)
+
+
+_CALLED_BY = spelled(_called_by)
+vars(compiled)["__get__"]._torchdynamo_inline = _got_in_graph
+
+
+class _Bound(dict[Any, Any]):
+    """The compiled methods of an object and its calls in graphs: none of a copy or a pickle."""
 
     def __init__(self, owner: Any = None) -> None:
         self.owner = owner
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _Bound, ()
+
+
+def bound_to(owner: Any) -> dict[Any, Any]:
+    """Return what is compiled of an object."""
+    bound: _Bound = vars(owner).setdefault(BOUND, _Bound(owner))
+    if bound.owner is not owner:  # that of which the owner is a shallow copy
+        bound = vars(owner)[BOUND] = _Bound(owner)
+    return bound
 
 
 class CompiledMethod:
@@ -138,7 +162,7 @@ class CompiledMethod:
     def __call__(self, x: Tensor, /) -> Tensor: ...
     @overload
     def __call__(self, x: Tensor, first: Tree, /, *more: Tree) -> Any: ...
-    @opaque
+    @one_operator
     def __call__(self, x: Tensor, /, *more: Tree) -> Any:
         """y: (..., n) -> (..., m), or trees of (B, ...)."""
         read = self._read
@@ -161,7 +185,7 @@ class CompiledMethod:
         except RuntimeError:  # a nested tensor has no size, a sparse one no strides
             return self._defined(x, *more)
         if plain:
-            return self._exported(x, *more) if is_exporting() else self._learned(x, *more)
+            return self._exported(x, *more) if _is_exporting() else self._learned(x, *more)
         if self._served is None or not worth(True):
             if not is_state(x):
                 return self._refused(x, *more)

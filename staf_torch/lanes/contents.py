@@ -73,6 +73,7 @@ class Contents:
     Attributes:
         key: of the settings inside; None where something cannot be written down (an open file, a lock).
         tensors: the floating-point tensors that the key leaves out, in an order that equal keys share.
+        others: all other tensors.
         reason: why there is no key, or what cannot be watched; None where all can.
         of_users: whether code of a user is among what objects hold or lead to, or nobody can say.
         told: objects by their addresses, and tensors by the names of the floats that they stand for.
@@ -89,7 +90,8 @@ class Contents:
             self.reason = walk.unwatched
         except Exception as error:  # of any object that a function names: a lock, a deep list, a proxy
             self.reason = f"{type(error).__name__}: {error}"
-        self.tensors, self.of_users = walk.tensors, walk.of_users or self.key is None
+        self.tensors, self.others = walk.tensors, walk.others
+        self.of_users = walk.of_users or self.key is None
         self.told = walk.told
         kinds = chain.from_iterable([each.__mro__ for each in walk.kept if isinstance(each, type)])
         classes = [(vars(kind), is_users(kind)) for kind in dict.fromkeys(kinds) if kind is not object]

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar, cast
 
 import torch._C._dynamo.eval_frame as frames
+
+from .graph_operator import spelled
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -24,6 +26,27 @@ def opaque(function: Callable[_P, _R]) -> Callable[_P, _R]:
     actions = frames._FrameAction
     frames.set_code_exec_strategy(function.__code__, frames._FrameExecStrategy(actions.SKIP, actions.SKIP))
     return function
+
+
+def one_operator(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Return the function that is one operator in a graph of `torch.compile`, and else as by `opaque`.
+
+    Calls elsewhere are those of the function itself.
+    """
+    made: Any = opaque(function)
+    for name in [name for name in vars(made) if name.startswith("_torchdynamo_disable")]:
+        delattr(made, name)
+    made._torchdynamo_inline = spelled(function)
+    if "." in function.__qualname__:
+        return cast("Callable[_P, _R]", made)
+
+    @functools.wraps(function)  # which copies attributes: that of a function a user's wrapper would have, too
+    def called(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        result: _R = made(*args, **kwargs)
+        return result
+
+    del called._torchdynamo_inline  # type: ignore[attr-defined]
+    return called
 
 
 def _alone(function: Callable[_P, _R]) -> Callable[_P, _R]:

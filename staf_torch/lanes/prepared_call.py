@@ -12,7 +12,7 @@ from .call import PlannedCall, Where, form, ordinary, say_transformed, seen, see
 from .call_inputs import Given, whole
 from .device.kernel import DeviceCall
 from .log import say
-from .opaque import opaque
+from .opaque import one_operator
 from .tree import Tree, flatten, unflatten
 
 if TYPE_CHECKING:
@@ -27,12 +27,13 @@ class Prepared:
     Called as the program is, without ``steps`` and ``every``. Inputs of other forms go to the program.
 
     Attributes:
+        program: that is called.
         plan: of the compiled call, once there was one; None before, and where the definition runs.
             On a device of its own it is a plan of kernels.
     """
 
     def __init__(self, program: Program, given: Given, every: int) -> None:
-        self._program, self._steps, self._every = program, given.times, whole("every", every, 1)
+        self.program, self._steps, self._every = program, given.times, whole("every", every, 1)
         leaves, self._structure = flatten(given.trees())
         self._forms = tuple(map(form, leaves))
         self._carries, self._carry = len(given.carry), given.structures["carry"]
@@ -45,30 +46,30 @@ class Prepared:
         """Return the parts of a copy, which finds its plan by itself."""
         return {**vars(self), "plan": None, "_where": None, "_gradient": None}
 
-    @opaque
+    @one_operator
     def __call__(self, carry: Tree, now: Tree = (), row: Tree = ()) -> tuple[Tree, Tree]:
         """The carry after the last step, and the outputs."""
         leaves, structure = flatten((row, now, carry))
         forms, where = seen(leaves)
         if structure != self._structure or forms != self._forms:
-            return self._program(carry, now, row, steps=self._steps, every=self._every)
+            return self.program(carry, now, row, steps=self._steps, every=self._every)
         return self.run(leaves, where, carry, now, row)
 
     def run(
         self, leaves: Sequence[Any], where: Where, carry: Tree, now: Tree, row: Tree
     ) -> tuple[Tree, Tree]:
         """Run with inputs that are known to fit, and to be somewhere."""
-        if self._refused or not where or self._program.differentiated():
+        if self._refused or not where or self.program.differentiated():
             return self._otherwise(leaves, carry, now, row)
         if where != self._where:
             given = Given.of(carry, now, row, self._steps)
-            self._program.reads()
-            if not self._program.differentiated():
+            self.program.reads()
+            if not self.program.differentiated():
                 self.plan, self._where = self._planned(given, leaves, where), where
-            if self._program.differentiated():
+            if self.program.differentiated():
                 return self._otherwise(leaves, carry, now, row)
         if self.plan is None:
-            return self._program.definition(carry, now, row, steps=self._steps, every=self._every)
+            return self.program.definition(carry, now, row, steps=self._steps, every=self._every)
         rooms = iter(self.plan(leaves))
         return unflatten(self._carry, rooms), unflatten(self.plan.structure, rooms)
 
@@ -90,16 +91,16 @@ class Prepared:
         if not self._refused and torch.is_grad_enabled() and not seen_by_others():
             if self._gradient is None:
                 given = Given.of(carry, now, row, self._steps)
-                self._gradient = GradientCall(self._program, given, self._every)
+                self._gradient = GradientCall(self.program, given, self._every)
             found = self._gradient(leaves)
             if found is not None:
                 return found
-        if self._program.compile:
-            say_transformed(self._program.name)
-        return self._program.definition(carry, now, row, steps=self._steps, every=self._every)
+        if self.program.compile:
+            say_transformed(self.program.name)
+        return self.program.definition(carry, now, row, steps=self._steps, every=self._every)
 
     def _planned(self, given: Given, leaves: Sequence[Any], where: Where) -> Plan | None:
-        compiled = self._program.find(given)
+        compiled = self.program.find(given)
         if compiled is None:
             return None
         times = [False] * len(given.row) + [True] * len(given.now) + [False] * len(given.carry)

@@ -20,7 +20,7 @@ from .locks import Mutex
 from .log import say
 from .loops import few_passes, scan, tracing_now
 from .one_thread import ENTRIES, alone
-from .opaque import opaque
+from .opaque import one_operator
 from .prepared_call import Prepared
 from .row_c import RowC
 from .row_independence import doubt, undrawn
@@ -127,7 +127,7 @@ class Program(Derived):
         program.adjoints = self.adjoints
         return program
 
-    @opaque
+    @one_operator
     def __call__(
         self, carry: Tree, now: Tree = (), row: Tree = (), *, steps: int | None = None, every: int = 1
     ) -> tuple[Tree, Tree]:

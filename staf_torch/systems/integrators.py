@@ -15,7 +15,7 @@ from ..lanes.device.chunks import rows_of, with_rows
 from ..lanes.device.host import capturing
 from ..lanes.gradients import wants_gradient
 from ..lanes.loop_program import LoopProgram
-from ..lanes.opaque import opaque
+from ..lanes.opaque import one_operator
 from ..lanes.plain_time import DIFFERENTIATED
 from ..lanes.row_numbers import over_rows, over_some_rows, some_rows
 from ..lanes.shared_programs import SharedPrograms
@@ -222,7 +222,7 @@ def _refined(
     return after, piece
 
 
-@opaque
+@one_operator
 @Sign("systems.simulate")
 @beside
 def simulate(system: ControlAffineSystem, x0: Tensor, *, dt: float, steps: int) -> Tensor:
