@@ -45,7 +45,7 @@ def one_operator(function: Callable[_P, _R]) -> Callable[_P, _R]:
         result: _R = made(*args, **kwargs)
         return result
 
-    del called._torchdynamo_inline  # type: ignore[attr-defined]
+    vars(called).pop("_torchdynamo_inline", None)
     return called
 
 
