@@ -297,8 +297,9 @@ def _apart(tensors: Sequence[Tensor], forms: Sequence[TensorForm], others: Seque
     """Return tensors of given strides that share memory with none of these, with others, or with autograd."""
     used, found = {x.untyped_storage().data_ptr() for x in others}, []
     for x, form in zip(tensors, forms, strict=True):
-        memory, kept = x.untyped_storage().data_ptr(), x.grad_fn is not None and not hasattr(x.grad_fn, "ran")
-        fits = memory not in used and x.stride() == form.stride and not kept  # no program keeps its results
+        memory = x.untyped_storage().data_ptr()
+        # The backward pass may read a result, and a graph uses its memory again when it is done with it.
+        fits = memory not in used and x.stride() == form.stride and x.grad_fn is None
         found.append(x.detach() if fits else form.empty().copy_(x.detach()))
         used.add(memory)
     return found

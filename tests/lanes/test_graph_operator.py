@@ -12,6 +12,9 @@ import pytest
 import torch
 from helpers import tensor, uniform
 from torch import Tensor, nn
+from torch._dynamo.backends.common import aot_autograd
+from torch._functorch.aot_autograd import make_boxed_func
+from torch.utils._pytree import tree_leaves
 from torch.utils.checkpoint import checkpoint
 from torch.utils.data import DataLoader, Dataset
 
@@ -104,6 +107,36 @@ def test_a_gradient_is_that_of_the_numbers_of_its_forward_pass() -> None:
         model.gain.mul_(2)
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
         value.backward()
+
+
+class Reusing(torch.fx.Interpreter):
+    """Runs a graph as torch's compiler does, which uses the memory of a tensor again after its last use."""
+
+    def run_node(self, n: torch.fx.Node) -> Any:
+        found = super().run_node(n)
+        gone = [node for node in self.user_to_last_uses.get(n, ()) if node.op == "call_function"]
+        left = found, [value for node, value in self.env.items() if node not in gone]
+        used = {x.untyped_storage().data_ptr() for x in tree_leaves(left) if isinstance(x, Tensor)}
+        for x in tree_leaves([self.env[node] for node in gone]):
+            if x.is_floating_point() and x.untyped_storage().data_ptr() not in used:
+                torch.empty(0, dtype=x.dtype).set_(x.untyped_storage()).fill_(torch.nan)
+        return found
+
+
+def test_a_graph_may_use_the_memory_of_a_result_again() -> None:
+    """The backward pass of a program reads results that are its carry, too."""
+
+    def reused(graph: torch.fx.GraphModule, inputs: Any) -> Any:
+        return make_boxed_func(Reusing(graph).run)
+
+    def loss(x: Tensor) -> Tensor:
+        end, out = LEARNED(x, steps=20)
+        value: Tensor = (2 * out).sin().square().sum() + end.sum()
+        return value
+
+    compiled = torch.compile(loss, backend=aot_autograd(fw_compiler=reused), fullgraph=True)
+    for _ in range(2):
+        assert same(loss, compiled, GAIN)
 
 
 GAIN = nn.Parameter(tensor(1.1))
