@@ -182,6 +182,7 @@ class GraphCall:
         self._contents, self._captured = contents, [*contents.tensors, *contents.others]
         self.inputs = [*forms, *(TensorForm.of(x, recorded=surroundings.recorded) for x in self._captured)]
         self.wanted = any(form.wanted for form in self.inputs)
+        self._learned = [x.requires_grad for x in self._captured]
         self._surroundings = surroundings
         with self._surroundings.again():
             found = self.called([form.example() for form in forms])
@@ -195,6 +196,8 @@ class GraphCall:
 
     def fresh(self) -> bool:
         """Return whether its objects hold and lead to what they did, but for numbers of these tensors."""
+        if [x.requires_grad for x in self._captured] != self._learned:
+            return False
         return self._contents.unchanged(library=False) or self._contents.renewed()
 
     def called(self, tensors: Sequence[Tensor]) -> tuple[list[Tensor], Any, tuple[Any, ...]]:

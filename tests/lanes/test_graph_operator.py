@@ -90,6 +90,9 @@ def test_what_a_step_reads_may_change_between_calls_of_a_graph() -> None:
     assert same(model, compiled, *model.parameters())
     found.append(compiled(X))
     assert len({value.item() for value in found}) == 4
+    for learned in (False, True):
+        model.gain.requires_grad_(learned)
+        assert same(model, compiled, *(each for each in model.parameters() if each.requires_grad))
 
 
 def test_a_gradient_is_that_of_the_numbers_of_its_forward_pass() -> None:
