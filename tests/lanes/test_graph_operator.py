@@ -10,11 +10,9 @@ from typing import Any
 
 import pytest
 import torch
+from functorch.compile import aot_module_simplified, make_boxed_func
 from helpers import tensor, uniform
 from torch import Tensor, nn
-from torch._dynamo.backends.common import aot_autograd
-from torch._functorch.aot_autograd import make_boxed_func
-from torch.utils._pytree import tree_leaves
 from torch.utils.checkpoint import checkpoint
 from torch.utils.data import DataLoader, Dataset
 
@@ -118,26 +116,36 @@ class Reusing(torch.fx.Interpreter):
     def run_node(self, n: torch.fx.Node) -> Any:
         found = super().run_node(n)
         gone = [node for node in self.user_to_last_uses.get(n, ()) if node.op == "call_function"]
-        left = found, [value for node, value in self.env.items() if node not in gone]
-        used = {x.untyped_storage().data_ptr() for x in tree_leaves(left) if isinstance(x, Tensor)}
-        for x in tree_leaves([self.env[node] for node in gone]):
+        left = tensors([found, *(value for node, value in self.env.items() if node not in gone)])
+        used = {x.untyped_storage().data_ptr() for x in left}
+        for x in tensors([self.env[node] for node in gone]):
             if x.is_floating_point() and x.untyped_storage().data_ptr() not in used:
                 torch.empty(0, dtype=x.dtype).set_(x.untyped_storage()).fill_(torch.nan)
         return found
 
 
+def tensors(tree: Any) -> list[Tensor]:
+    """Return the tensors in nested lists and tuples."""
+    if isinstance(tree, list | tuple):
+        return [x for part in tree for x in tensors(part)]
+    return [tree] if isinstance(tree, Tensor) else []
+
+
 def test_a_graph_may_use_the_memory_of_a_result_again() -> None:
     """The backward pass of a program reads results that are its carry, too."""
 
-    def reused(graph: torch.fx.GraphModule, inputs: Any) -> Any:
-        return make_boxed_func(Reusing(graph).run)
+    def reusing(graph: torch.fx.GraphModule, inputs: Any) -> Any:
+        def compiler(traced: torch.fx.GraphModule, _: Any) -> Any:
+            return make_boxed_func(Reusing(traced).run)
+
+        return aot_module_simplified(graph, inputs, fw_compiler=compiler)
 
     def loss(x: Tensor) -> Tensor:
         end, out = LEARNED(x, steps=20)
         value: Tensor = (2 * out).sin().square().sum() + end.sum()
         return value
 
-    compiled = torch.compile(loss, backend=aot_autograd(fw_compiler=reused), fullgraph=True)
+    compiled = torch.compile(loss, backend=reusing, fullgraph=True)
     for _ in range(2):
         assert same(loss, compiled, GAIN)
 
@@ -217,6 +225,7 @@ def test_no_graph_keeps_a_program() -> None:
     whole(model)(X).backward()
     program = weakref.ref(model.program)
     del model
+    torch.compiler.reset()  # what torch's compiler keeps is its own
     gc.collect()
     assert program() is None
 
