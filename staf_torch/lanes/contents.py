@@ -90,6 +90,7 @@ class Contents:
             self.reason = walk.unwatched
         except Exception as error:  # of any object that a function names: a lock, a deep list, a proxy
             self.reason = f"{type(error).__name__}: {error}"
+        walk.clear_memo()  # in which the garbage collector of Python 3.11.2 finds no cycle
         self.tensors, self.others = walk.tensors, walk.others
         self.of_users = walk.of_users or self.key is None
         self.told = walk.told
