@@ -367,3 +367,12 @@ def decided(name: str) -> Any:
 def test_what_numbers_decide_is_refused_on_the_meta_device(name: str) -> None:
     with pytest.raises(ValueError, match=rf"`{name}.*must have numbers, which decide .* meta"):
         decided(name)
+
+
+def test_an_error_of_a_users_plant_is_his_own() -> None:
+    class Plant(systems.Pendulum):
+        def drift(self, x: Tensor) -> Tensor:
+            raise RuntimeError("Metabolism needs numbers")
+
+    with pytest.raises(RuntimeError, match=r"^Metabolism needs numbers$"):
+        systems.simulate(Plant(), X0, dt=0.01, steps=3)

@@ -126,7 +126,9 @@ class GradientCall:
         self._plans: dict[Any, tuple[Compiled, Plan]] = {}
         self.followers: dict[Hashable, tuple[Program, tuple[Hashable, Any], Any]] = {}
         self._keepers: dict[Where, tuple[Program, Hashable]] = {}  # programs, and where what is built stands
-        self._choices: dict[Hashable, Choice] = {}
+        self._choices: dict[
+            Hashable, tuple[Any, Choice]
+        ] = {}  # with a trace, whose address is then used once
         self._keepings: dict[Hashable, Keeping] = {}
         self._place: tuple[Where, Hashable] = False, None  # of the program that keeps nothing
         self._refused, self._unasked = False, 0  # calls since a gradient was asked for
@@ -186,8 +188,12 @@ class GradientCall:
         trace, known = built.trace, self.adjoints.get(id(built.trace))
         key = id(trace), where, _budget, None if known is None else len(known[1])  # which only grows
         if key not in self._choices:
-            self._choices[key] = self._chosen(where, built, None if known is None else frozenset(known[1]))
-        keeps, written = self._choices[key]
+            if len(self._choices) >= _PLANS:
+                self._choices.clear()
+                self._keepings.clear()
+            read = None if known is None else frozenset(known[1])
+            self._choices[key] = trace, self._chosen(where, built, read)
+        keeps, written = self._choices[key][1]
         if where is True and keeps and written and self._unasked >= _PATIENCE:
             return keeps - written, None
         return keeps, written

@@ -212,13 +212,14 @@ class Backward:
         """
         if not self._needed.issubset(self._ran.keeps or ()):
             kept = []
+        assert self.built is not None
         call, (rows, times) = self._call, self._blocks(bool(kept))
         slopes, sums = list[list[Tensor]](), list[list[Tensor]]()
         at_times = AtTimes(
             [x for x, need in zip(self._now, self._of_now, strict=True) if need],
             call.rows,
             call.times,
-            torch.empty(0, dtype=self._ran.built.compiled.real, device=self._device),
+            torch.empty(0, dtype=self.built.compiled.real, device=self._device),
         )
         for start in range(0, call.rows, rows):
             block = slice(start, min(start + rows, call.rows))
@@ -338,9 +339,11 @@ class Backward:
 
     def _again(self, rows: slice, times: slice, begin: Sequence[Tensor]) -> tuple[list[Tensor], Any]:
         """The carry before times of some rows, and what makes it while the adjoint runs, if that is so."""
-        if not self._on_processor or not begin:
-            return self._carries(rows, times, begin, 1), None
         compiled, count = self._ran.built.compiled, len(begin)
+        # In float32 with a captured tensor of float64 the adjoint is in float64: it reads other numbers.
+        alike = self.built is not None and self.built.compiled.real == compiled.real
+        if not self._on_processor or not begin or not alike:
+            return self._carries(rows, times, begin, 1), None
         like = torch.empty(0, dtype=compiled.real, device="cpu")
         shape = rows.stop - rows.start, times.stop - times.start
         before = [empty_rows(like, shape[0], (1,), s).expand(*shape, *s) for s, _ in compiled.carry]

@@ -225,6 +225,27 @@ def test_corners_and_ties_are_torchs(dtype: torch.dtype) -> None:
         torch.testing.assert_close(one, other, rtol=tolerance, atol=tolerance, equal_nan=True)
 
 
+@pytest.mark.parametrize(("rows", "times"), [(3, 33), (70, 5)])
+def test_a_parameter_in_float64_that_a_step_in_float32_reads_has_its_gradient(rows: int, times: int) -> None:
+    """The adjoint is in float64 then, and its carry in float32: it wrote beyond the memory of its results."""
+    gain = nn.Parameter(tensor(0.7))
+
+    def pair(carry: tuple[Tensor, Tensor], _: Tree, __: Tree) -> tuple[Tree, Tensor]:
+        a, b = carry
+        late = 0.9 * a + 0.05 * gain * b.sum((1, 2)).tanh()
+        return (late, 0.9 * b + 0.05 * gain * a.tanh().reshape(-1, 1, 1)), (a * late).exp().clamp(max=3)
+
+    program = lanes.Program(pair)
+    given = [uniform(rows, *shape).float().requires_grad_() for shape in ((), (2, 3))]
+    for _ in range(2):  # the carry is computed again, and kept
+        found = []
+        for call in (program, program.definition):
+            (a, b), out = call(tuple(given), steps=times)
+            found.append(torch.autograd.grad(a.sum() + b.sum() + out.square().sum(), [*given, gain]))
+        for one, other in zip(*found, strict=True):
+            torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-4)
+
+
 def test_a_budget_that_is_none_is_refused() -> None:
     told = r"gradient_memory\(mebibytes=...\)` must be positive; got 0"
     with pytest.raises(ValueError, match=told), lanes.gradient_memory(0):

@@ -59,14 +59,15 @@ def explained(error: RuntimeError, call: str) -> Exception:
         error: of torch.
         call: the function that met it.
     """
-    where = _where(traceback.extract_tb(error.__traceback__))
-    if re.search(r"\bmeta (tensor|device)|Meta", str(error)):
+    if re.search(r"\b([Mm]eta tensor|[Mm]eta device|device meta|register_meta)", str(error)):
+        where = _where(traceback.extract_tb(error.__traceback__))
         return ValueError(
             f"`{call.removesuffix('.__init__')}` must have numbers, which decide{where}, and the meta device "
             f'has none: compute on the CPU, and move what is made there by `.to("meta")` ({error}).'
         )
     if "data pointer of Tensor that doesn't have storage" not in str(error):
         return error
+    where = _where(traceback.extract_tb(error.__traceback__))
     return ValueError(
         f"numbers leave torch{where}, in a function of which derivatives are taken; {instead_of('numpy')} "
         f"({error})."
