@@ -59,17 +59,18 @@ def test_each_coordinate_and_each_stream_has_its_own_width() -> None:
     assert float(found.spread[1, 0]) > 1.5 * float(found.spread[1, 1])
 
 
-def test_streams_that_drift_forget_and_others_do_not() -> None:
-    x, y = drawn(torch.tensor([0.7, 0.7]).double(), 0.05)
+@pytest.mark.parametrize(("steps", "seed"), [(150, 1), (220, 2)])
+def test_streams_that_drift_are_followed_and_others_predicted_as_by_one_that_never_forgets(
+    steps: int, seed: int
+) -> None:
+    """By their errors: forgetting, noise and width predict nearly alike along a ridge of values."""
+    x, y = drawn(torch.tensor([0.7, 0.7]).double(), 0.05, steps=steps, seed=seed)
     drift = y + (0.15 * torch.arange(len(y), dtype=torch.float64)).sin() * x[:, 0]
     both = x[:, None].expand(-1, 2, -1), torch.stack((y, drift), 1)
-    tuned = st.StaFRegressor().tune(*both)
-    found = tuned.tuning
-    assert found is not None
-    gains = (1 - found.forgetting) / found.ratio  # what a stream forgets between samples beside their noise
-    assert float(gains[1]) > 3 * float(gains[0])
+    resting, drifting = errors(st.StaFRegressor().tune(*both), *both)
     never = st.StaFRegressor(st.GaussianKernel(0.7), 0.35, noise=0.05, forgetting=1.0)
-    assert errors(tuned, *both)[1] < 0.85 * errors(never, x, drift)
+    assert drifting < 0.9 * errors(never, x, drift)
+    assert resting < 1.1 * errors(never, x, y)
 
 
 def test_tuning_knows_no_units_and_is_saved_with_what_was_learned() -> None:
