@@ -22,14 +22,13 @@ from ..figures.closed_loop import AdpHistory, draw_adp
 from ..figures.style import draws, images
 from ..lanes.tree import flatten, unflatten
 from ..metrics.closed_loop import adp_metrics
-from ..results.files import grouped
 from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.adp import adp_problem
 from ..settings.chase import make_metrics
 from ..systems import Plant
 from ..tables.columns import significant
-from .numbers_of_jobs import RowsOfJobs, ToldOnce, in_calls
+from .numbers_of_jobs import RowsOfJobs, in_calls
 from .registry import BatchedExperiment, Metrics
 from .scenes import animation_kind, loop_scene, write_animation
 from .study import log_diverged, trajectories, write_history
@@ -177,30 +176,20 @@ def simulate_together(
         problems: at least one; of the same number of steps.
         progress: as in `simulate`.
     """
-    found: dict[int, LoopResult] = {}
-    told = ToldOnce(progress)
 
-    def shared(i: int) -> tuple[object, ...]:
-        one = problems[i]
-        return one.dt, one.steps, one.every, one.integrator, one.compile
+    def run(
+        jobs: Sequence[int], objects: Any, rows: RowsOfJobs, advance: Callable[[int], None] | None
+    ) -> list[LoopResult]:
+        with rows.of():
+            return _simulated([problems[i] for i in jobs], objects, advance)
 
-    for indices in grouped(range(len(problems)), shared).values():
-
-        def run(
-            jobs: Sequence[int], objects: Any, rows: RowsOfJobs, indices: Sequence[int] = indices
-        ) -> None:
-            chosen = [indices[job] for job in jobs]
-            with rows.of(), told.call() as tell:
-                heard = None if progress is None else tell
-                results = _simulated([problems[i] for i in chosen], objects, heard)
-            found.update(zip(chosen, results, strict=True))
-
-        in_calls(
-            [(problems[i].controller, problems[i].system, problems[i].cost) for i in indices],
-            [len(problems[i].initial_states) for i in indices],
-            run,
-        )
-    return [found[i] for i in range(len(problems))]
+    return in_calls(
+        run,
+        [(one.controller, one.system, one.cost) for one in problems],
+        [len(one.initial_states) for one in problems],
+        [(one.dt, one.steps, one.every, one.integrator, one.compile) for one in problems],
+        progress,
+    )
 
 
 def _simulated(

@@ -18,10 +18,9 @@ from ..lanes.row_numbers import over_rows
 from ..metrics.ball_error import StateErrorPass
 from ..metrics.chase import ChaseMetrics, Member
 from ..optim import UpdateLaw
-from ..results.files import grouped
 from ..settings.chase import ChaseProblem, warnings_to
 from ..systems import ControlAffineSystem, trajectory
-from .numbers_of_jobs import RowsOfJobs, ToldOnce, in_calls
+from .numbers_of_jobs import RowsOfJobs, in_calls
 
 Sink = Callable[[Mapping[str, np.ndarray], int, int], None]
 """Takes a piece of a problem's history, name -> (b, C, ...), with its first row and its first time."""
@@ -69,29 +68,20 @@ def simulate(
     Returns:
         In the order of the problems.
     """
-    found: dict[int, Outcome] = {}
-    alone, told = len(problems) == 1, ToldOnce(advance)
+    objects = [_Objects.of(problem) for problem in problems]
 
-    def shared(i: int) -> tuple[object, ...]:
-        return (problems[i].dt, *map(id, problems[i].metrics))
+    def run(
+        jobs: Sequence[int], parts: _Objects, rows: RowsOfJobs, advance: Callable[[int], None] | None
+    ) -> list[Outcome]:
+        members = [_BatchMember(problems[i], sinks[i], drawn[i]) for i in jobs]
+        return _run(members, parts, rows, advance, errors, alone=len(problems) == 1)
 
-    for indices in grouped(range(len(problems)), shared).values():
+    def alike(i: int) -> tuple[object, ...]:
+        own = problems[i].metrics  # of the user's, which see one problem at a time
+        return problems[i].dt, *map(id, own), *(map(id, objects[i]) if own else ())
 
-        def run(
-            jobs: Sequence[int], parts: _Objects, rows: RowsOfJobs, indices: Sequence[int] = indices
-        ) -> None:
-            chosen = [indices[job] for job in jobs]
-            members = [_BatchMember(problems[i], sinks[i], drawn[i]) for i in chosen]
-            with told.call() as tell:
-                found.update(zip(chosen, _run(members, parts, rows, tell, errors, alone=alone), strict=True))
-
-        in_calls(
-            [_Objects.of(problems[i]) for i in indices],
-            [len(problems[i].initial_states) for i in indices],
-            run,
-            apart=bool(problems[indices[0]].metrics),  # of the user's, which see one problem at a time
-        )
-    return [found[i] for i in range(len(problems))]
+    counts = [len(problem.initial_states) for problem in problems]
+    return in_calls(run, objects, counts, [alike(i) for i in range(len(problems))], advance)
 
 
 class _Objects(NamedTuple):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 
@@ -19,7 +19,8 @@ _REFUSALS = (ValueError, TypeError, NotImplementedError, RuntimeError)
 """What objects raise that do not serve numbers of a row's own."""
 
 Objects = tuple[Any, ...]
-Call = Callable[[Sequence[int], Any, "RowsOfJobs"], None]
+R = TypeVar("R")
+Advance = Callable[[int], None]
 
 
 class RowsOfJobs:
@@ -50,11 +51,11 @@ class ToldOnce:
         advance: is told how much more is done; None where nobody listens.
     """
 
-    def __init__(self, advance: Callable[[int], None] | None) -> None:
+    def __init__(self, advance: Advance | None) -> None:
         self._advance, self._ahead = advance, 0  # told by calls that failed
 
     @contextlib.contextmanager
-    def call(self) -> Iterator[Callable[[int], None]]:
+    def call(self) -> Iterator[Advance]:
         """Yield what is told of a call's progress within the block."""
         told = 0
 
@@ -73,46 +74,72 @@ class ToldOnce:
             raise
 
 
-def in_calls(objects: Sequence[Objects], counts: Sequence[int], call: Call, *, apart: bool = False) -> None:
-    """Make a call for each set of jobs whose objects differ in numbers alone.
+class _Set(NamedTuple):
+    """Jobs of one call."""
 
-    Where objects differ in more they are of several sets, and where a call refuses numbers of a row's own, as
-    not all objects serve them, its jobs run one after the other: those of the same objects together.
+    jobs: list[int]
+    objects: Objects  # with the numbers of all of them
+    kinds: list[int]  # of each job, the row of its numbers
+    alone: list[_Set]  # the calls in place of this one where it refuses numbers of a row's own
+
+
+def in_calls(
+    call: Callable[[Sequence[int], Any, RowsOfJobs, Advance | None], Sequence[R]],
+    objects: Sequence[Objects],
+    counts: Sequence[int],
+    alike: Sequence[Hashable],
+    advance: Advance | None = None,
+) -> list[R]:
+    """Return the results of jobs, of which those whose objects differ in numbers alone share a call.
+
+    Where objects differ in more there are several calls, and where one refuses numbers of a row's own, as not
+    all objects serve them, its jobs run one after the other: those of the same objects together.
 
     Args:
+        call: gets the jobs by number, the objects that have the numbers of all, their rows, and `advance`;
+            returns the results of the jobs.
         objects: of each job; the same object for jobs that share it.
         counts: rows of each job.
-        call: gets the jobs of a set by number, the objects that have the numbers of all, and their rows.
-        apart: whether jobs of other objects never share a call.
+        alike: what jobs must have in common to share a call.
+        advance: is told how much more is done; None where nobody listens.
     """
-    same = grouped(range(len(objects)), lambda i: tuple(map(id, objects[i])))
-    distinct = [objects[jobs[0]] for jobs in same.values()]
-
-    def made(jobs: Sequence[int], found: Objects, kinds: Sequence[int]) -> None:
-        call(jobs, found, RowsOfJobs(kinds, [counts[i] for i in jobs]))
-
-    for some, joined in [([each], None) for each in distinct] if apart else _sets(distinct):
-        each = [same[tuple(map(id, parts))] for parts in some]
+    found: dict[int, R] = {}
+    told = ToldOnce(advance)
+    groups = grouped(range(len(objects)), lambda i: alike[i]).values()
+    waiting = [each for jobs in groups for each in _sets(jobs, objects)]
+    while waiting:
+        some = waiting.pop(0)
+        rows = RowsOfJobs(some.kinds, [counts[i] for i in some.jobs])
         try:
-            if joined is not None:
-                kinds = [k for k, jobs in enumerate(each) for _ in jobs]
-                made([i for jobs in each for i in jobs], joined, kinds)
-                continue
+            with told.call() as tell:
+                results = call(some.jobs, some.objects, rows, None if advance is None else tell)
         except _REFUSALS as error:
-            _log.debug("%d jobs run one after the other: %s", len(some), error)
-        for parts, jobs in zip(some, each, strict=True):
-            made(jobs, parts, [0] * len(jobs))
+            if not some.alone:
+                raise
+            _log.debug("%d jobs run one after the other: %s", len(some.alone), error)
+            waiting[:0] = some.alone
+        else:
+            found.update(zip(some.jobs, results, strict=True))
+    return [found[i] for i in range(len(objects))]
 
 
-def _sets(objects: Sequence[Objects]) -> list[tuple[Sequence[Objects], Objects | None]]:
-    """Return the objects in sets, with those that have the numbers of all of a set; None of one alone."""
-    if len(objects) == 1:
-        return [(objects, None)]
+def _sets(jobs: Sequence[int], objects: Sequence[Objects]) -> list[_Set]:
+    """Return the calls of jobs, in which objects are merged that differ in numbers alone."""
+    same = grouped(jobs, lambda i: tuple(map(id, objects[i]))).values()
+    return _joined([_Set(each, objects[each[0]], [0] * len(each), []) for each in same])
+
+
+def _joined(alone: list[_Set]) -> list[_Set]:
+    """Return calls of distinct objects as one, or as a few where objects differ in more than numbers."""
+    if len(alone) == 1:
+        return alone
     try:
-        return [(objects, merged(objects))]
+        merged_objects = merged([each.objects for each in alone])
     except ValueError:  # they differ in more than numbers
-        keys = [Contents(*each, telling=True).key for each in objects]
-    sets = grouped(range(len(objects)), lambda i: (i,) if keys[i] is None else keys[i])
-    if len(sets) == 1:
-        return [([each], None) for each in objects]
-    return [found for some in sets.values() for found in _sets([objects[i] for i in some])]
+        keys = [Contents(*each.objects, telling=True).key for each in alone]
+        sets = grouped(range(len(alone)), lambda i: (i,) if keys[i] is None else keys[i]).values()
+        if len(sets) == 1:
+            return alone
+        return [each for some in sets for each in _joined([alone[i] for i in some])]
+    kinds = [kind for kind, each in enumerate(alone) for _ in each.jobs]
+    return [_Set([job for each in alone for job in each.jobs], merged_objects, kinds, alone)]

@@ -22,7 +22,7 @@ from ..experiments.registry import (
     check_animation,
     experiment,
 )
-from ..figures.style import FigurePaper, in_a_sweep, printed_on
+from ..figures.style import in_a_sweep
 from ..results.progress import SHOWN, Progress
 from ..settings.plain import to_read
 from ..settings.suggestions import without_option, without_setting
@@ -192,21 +192,16 @@ def completion(cfg: DictConfig, outcome: Outcome) -> Experiment:
         Exception: that of a job that failed, or ValueError for an animation that the experiment has not.
     """
     check_animation(cfg)
-    paper, study = FigurePaper.of(cfg.get("figures", True)), experiment(cfg.task)
-
-    def left(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
-        with printed_on(paper):
-            match outcome:
-                case Computed(solution):
-                    assert isinstance(study, BatchedExperiment)
-                    return study.write(cfg, directory, solution)
-                case Written():
-                    return outcome.replay(cfg, directory, progress)
-            return study(cfg, directory, progress)
-
-    if isinstance(outcome, Failed):
-        raise outcome.error
-    return left
+    study = experiment(cfg.task)
+    match outcome:
+        case Failed(error):
+            raise error
+        case Computed(solution):
+            assert isinstance(study, BatchedExperiment)
+            return lambda cfg, directory, progress=SHOWN: study.write(cfg, directory, solution)
+        case Written():
+            return outcome.replay
+    return study
 
 
 def _group_and_size(settings: Flat, index: int) -> tuple[str, int]:

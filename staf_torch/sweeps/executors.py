@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import abc
 import contextlib
+import itertools
 import logging
 import os
 import pickle
 import sys
 import time
 import warnings
-from collections.abc import Callable, Collection, Generator, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig
 
-from ..figures.style import in_a_sweep
+from ..figures.style import FigurePaper, in_a_sweep, printed_on
 from ..numerics.checks import integer
 from ..results.progress import SHOWN, Progress
 from ..settings.plain import ManySettings
@@ -51,8 +52,8 @@ def compute(
     most: int | None = None,
     measured: bool = False,
     tell: Callable[[float], None],
-) -> Generator[tuple[int, Outcome, float], None, None]:
-    """Yield index, outcome and seconds of every job that is not finished, as the tensor batches end.
+) -> Iterator[tuple[int, Outcome, float]]:
+    """Return index, outcome and seconds of every job that is not finished, as the tensor batches end.
 
     A batch of which some jobs are finished is computed as a whole: rounding depends on the others in it, and
     a sweep that was interrupted ends with the very numbers that it would have had.
@@ -84,12 +85,16 @@ def compute(
     wanted = [[i for i in batch if i not in finished] for batch in planned]
     done, left = 0, [len(batch) for batch in wanted]
     listening = Progress(lambda share: tell(done + share * next(filter(None, left), 0)))
-    for number, (outcomes, seconds) in workers.map(made, listening):
+
+    def ended(batch: tuple[int, Done]) -> list[tuple[int, Outcome, float]]:
+        nonlocal done
+        number, (outcomes, seconds) = batch
         done, left[number] = done + left[number], 0
         tell(done)
         found = dict(zip(planned[number], outcomes, strict=True))
-        for index in wanted[number]:
-            yield index, found[index], seconds / len(outcomes)
+        return [(index, found[index], seconds / len(outcomes)) for index in wanted[number]]
+
+    return itertools.chain.from_iterable(map(ended, workers.map(made, listening)))
 
 
 class Executor(abc.ABC):
@@ -279,7 +284,8 @@ def _run_whole(cfg: DictConfig, directory: Path) -> Outcome:
     directory.mkdir(parents=True, exist_ok=True)
     with _kept_log() as lines, in_a_sweep():
         try:
-            return Written(completion(cfg, DEFERRED)(cfg, directory, SHOWN), lines)
+            with printed_on(FigurePaper.of(cfg.get("figures", True))):
+                return Written(completion(cfg, DEFERRED)(cfg, directory, SHOWN), lines)
         except Exception as error:
             return Failed(error)
 

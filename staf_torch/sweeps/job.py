@@ -16,7 +16,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from ..experiments.registry import Metrics
-from ..figures.style import in_a_sweep
+from ..figures.style import FigurePaper, in_a_sweep, printed_on
 from ..lanes.compiler import compiler
 from ..numerics.checks import COMMAND_LINE, choice
 from ..results import run_record as records
@@ -70,12 +70,12 @@ def execute(
         else:
             if about.alone and records.completed(directory) is not None:
                 _log.info("replaces the run of the same command line in %s", os.path.relpath(directory))
-            name = choices.get("experiment") or cfg.task
-            swept = in_a_sweep(not about.alone)
-            with Sign(f"experiment {name}"), recorded(record, directory, seconds), swept:
+            sign = Sign(f"experiment {choices.get('experiment') or cfg.task}")
+            with sign, recorded(record, directory, seconds), in_a_sweep(not about.alone):
                 record.declare([metric.info for metric in make_metrics(cfg.get("metric"))])
                 record.measured_in(units_of(cfg))
-                metrics = completion(cfg, outcome)(cfg, directory, progress)
+                with printed_on(FigurePaper.of(cfg.get("figures", True))):
+                    metrics = completion(cfg, outcome)(cfg, directory, progress)
             _log.info("  run directory: %s", os.path.relpath(directory))
             if pictures := sorted(path.name for path in (directory / FIGURES).glob("*.png")):
                 _log.info("  pictures: %s (%s)", os.path.relpath(directory / FIGURES), ", ".join(pictures))

@@ -8,7 +8,7 @@ import functools
 import gc
 import logging
 import sys
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,16 +19,16 @@ from ..numerics.checks import choice, integer
 from ..results import run_record as records
 from ..results.files import METRICS, ROWS, RUN, partial_name
 from ..results.progress import Progress
-from ..settings.plain import ManySettings
 from ..signs import Pace, Sign, write
 from . import lock, table, workers
-from .batching import Flat, Outcome, reason
+from .batching import Outcome, reason
 from .clusters import executor
 from .executors import Executor, compute
 from .hydra_compat import Job, JobReturn, JobStatus, Plan, SweepJobs, without_hydra_overrides
 from .job import PRINTS, execute, objective, silence_terminal
 
 _log = logging.getLogger(__name__)
+Task = Callable[[DictConfig], Any]
 
 _FOREIGN = ("run", "warn", "refuse")
 _NOT_BATCHED = (
@@ -181,7 +181,7 @@ class Launch:
     def __init__(self, launcher: Any) -> None:
         self._launcher = launcher
         self._jobs: SweepJobs = launcher.hydra_context.config_loader
-        self._task: Callable[[DictConfig], Any] = launcher.task_function
+        self._task: Task = launcher.task_function
         self._directory = Path(str(launcher.config.hydra.sweep.dir))
         self._directories: dict[int, Path] = {}  # of the jobs that ran
         if launcher.batch is not None:
@@ -258,13 +258,12 @@ class Launch:
         records.list_jobs(self._directory, numbered)
         returns = self._finished(numbered, plan)
         progress = SweepProgress(len(numbered), len(returns))
-        tasks = self._tasks(numbered, *plan, set(returns), progress)
         alike = AlikeFailures(list(numbered.values()), min(numbered, default=0))
         if returns:
             alike.ended(min(returns), None)
         index = {num: i for i, num in enumerate(numbered)}
-        with contextlib.closing(progress), contextlib.closing(tasks), _collecting_seldom():
-            for num, task in tasks:
+        with contextlib.closing(progress), contextlib.ExitStack() as stack, _collecting_seldom():
+            for num, task in self._tasks(numbered, plan, set(returns), progress, stack):
                 workers.check()
                 self._still_there(len(returns), len(numbered))
                 returns[num] = self._replay(task, self._jobs.job(num, numbered[num], plan, index[num]))
@@ -277,7 +276,7 @@ class Launch:
         _log.info("%d of %d jobs completed, %d failed", len(numbered) - failed, len(numbered), failed)
         return [returns[num] for num in numbered]
 
-    def _replay(self, task: Callable[[DictConfig], Any], job: Job) -> JobReturn:
+    def _replay(self, task: Task, job: Job) -> JobReturn:
         """Run a job whose outcome is known as Hydra runs one, and keep no settings of it."""
         self._directories[job.num] = job.directory
         ended = self._jobs.run(task, job)
@@ -322,31 +321,39 @@ class Launch:
     def _tasks(
         self,
         numbered: Mapping[int, list[str]],
-        settings: ManySettings,
-        flat: Sequence[Flat],
+        plan: Plan,
         finished: set[int],
         progress: SweepProgress,
-    ) -> Generator[tuple[int, Callable[[DictConfig], Any]], None, None]:
-        """Yield number and task of every job that is not finished, as the tensor batches end."""
+        stack: contextlib.ExitStack,
+    ) -> Iterator[tuple[int, Task]]:
+        """Return number and task of every job that is not finished, as the tensor batches end.
+
+        What computes them is given back as the ``stack`` ends.
+        """
         order, about = list(numbered), self._launcher
         if self._task is not execute:
             if about.foreign == "warn":
                 _log.warning("%s (hydra.launcher.foreign=run switches this warning off)", _NOT_BATCHED)
-            yield from ((num, self._task) for num in order)
-        elif len(finished) < len(order):
-            with self._executor() as executor:
-                for index, outcome, seconds in compute(
-                    *(settings, flat),
-                    lambda index: self._jobs.directory(order[index], numbered[order[index]]),
-                    executor,
-                    finished={i for i, num in enumerate(order) if num in finished},
-                    most=about.batch,
-                    tell=progress.computed,
-                ):
-                    yield order[index], _off_the_terminal(outcome, seconds, Progress(progress.running))
+            return ((num, self._task) for num in order)
+        if len(finished) == len(order):
+            return iter(())
+
+        def task(computed: tuple[int, Outcome, float]) -> tuple[int, Task]:
+            index, outcome, seconds = computed
+            return order[index], _off_the_terminal(outcome, seconds, Progress(progress.running))
+
+        outcomes = compute(
+            *plan,
+            lambda index: self._jobs.directory(order[index], numbered[order[index]]),
+            stack.enter_context(self._executor()),
+            finished={i for i, num in enumerate(order) if num in finished},
+            most=about.batch,
+            tell=progress.computed,
+        )
+        return map(task, outcomes)
 
 
-def _off_the_terminal(outcome: Outcome, seconds: float, progress: Progress) -> Callable[[DictConfig], Any]:
+def _off_the_terminal(outcome: Outcome, seconds: float, progress: Progress) -> Task:
     """Return the task of a computed job, logging to its file alone: summaries would bury the bar."""
 
     @functools.wraps(execute)
