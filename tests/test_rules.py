@@ -20,9 +20,8 @@ from variants import CONTROLLERS
 
 import staf_torch as st
 from staf_torch import adp, envs, kernels, optim, predictors, systems, theory
-from staf_torch.adp.adaptation.redesign import riccati_rows
 from staf_torch.adp.critic.bases import LeadingCoordinates
-from staf_torch.adp.estimation.kalman import KalmanFilter
+from staf_torch.adp.estimation import KalmanFilter
 from staf_torch.adp.loop.step import ClosedLoop
 from staf_torch.adp.policies.sampled_rollout import SampledRollout
 from staf_torch.adp.problem.held_linear import exact_hold
@@ -30,6 +29,7 @@ from staf_torch.approximation.conditioning import lebesgue_constant, sup_error
 from staf_torch.deploy.approximators import RidgeApproximator
 from staf_torch.envs.episodes import Episodes
 from staf_torch.numerics.registry import variants, without_arguments
+from staf_torch.numerics.riccati import riccati_rows
 from staf_torch.systems import trajectory
 
 ROOT = Path(st.__file__).parent

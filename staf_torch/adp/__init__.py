@@ -31,10 +31,10 @@ from .critic.laws import Gains as Gains
 from .critic.laws import Information as Information
 from .critic.laws import PolicyIteration as PolicyIteration
 from .critic.laws import Published as Published
-from .estimation.kalman import ExtendedKalman as ExtendedKalman
-from .estimation.kalman import Observed as Observed
-from .estimation.kalman import UnscentedKalman as UnscentedKalman
-from .estimation.measurement import Measured as Measured
+from .estimation import ExtendedKalman as ExtendedKalman
+from .estimation import Measured as Measured
+from .estimation import Observed as Observed
+from .estimation import UnscentedKalman as UnscentedKalman
 from .loop.controller import LQR as LQR
 from .loop.controller import Controller as Controller
 from .loop.controller import Feedback as Feedback

@@ -20,13 +20,14 @@ from ..numerics.checks import choice, flag, positive_real
 from ..numerics.default_device import beside
 from ..signs import Sign
 from ..systems import Plant
-from ..systems.bounds import Limit
+from ..systems.base import Limit
 from .loop.controller import LQR
 from .near_optimal_policy import PLANNED, NearOptimal, periods_in, settling
 from .policies.rollout import ball_directions
 from .problem.cost import Cost
 from .problem.rules import (
     check_endless,
+    check_objects,
     check_still,
     check_torch,
     held_period,
@@ -34,7 +35,6 @@ from .problem.rules import (
     slowest,
     warn_if_short,
 )
-from .problem.shapes import check_objects
 from .reach import Reach, extended, looked, reach_of_rows, whole
 
 _log = logging.getLogger(__name__)

@@ -28,7 +28,7 @@ from ..systems.base import spread_of
 from .loop.controller import LQR, Controller, ControllerOfKinds, Feedback
 from .loop.simulation import simulate
 from .planning.global_value import GlobalValue
-from .planning.global_value_sizes import box_of
+from .planning.global_value_learning import box_of
 from .planning.receding_horizon import BoundedPlans, StrainedPlans
 from .planning.shooting import DirectShooting
 from .policies.sampled_rollout import SampledRollout

@@ -19,8 +19,7 @@ from ..systems.user_plants import FunctionPlant
 from .loop.controller import LQR
 from .planning.ddp import BoxDDP
 from .planning.global_value import GlobalValue
-from .planning.global_value_learning import best_from
-from .planning.global_value_sizes import global_value_of
+from .planning.global_value_learning import best_from, global_value_of
 from .policies.sampled_rollout import SampledRollout
 from .problem.cost import Cost
 from .problem.sampled import SampledProblem

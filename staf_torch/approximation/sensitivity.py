@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from ..numerics.checks import trailing
-from ..numerics.linalg import row_jacobian
+from ..numerics.derivatives import row_jacobian
 from .basis import StaFBasis, Target
 
 

@@ -15,7 +15,7 @@ from ..lanes.one_thread import alone
 from ..lanes.row_objects import refuse_rows
 from ..numerics.checks import beside_batch, choice, fail, fails, flag, hold, integer, trailing
 from ..numerics.default_device import beside
-from ..numerics.linalg import row_jacobian
+from ..numerics.derivatives import row_jacobian
 from ..numerics.row_checks import check_target
 from .basis import StaFBasis, Target
 

@@ -16,8 +16,8 @@ from torch import Tensor, nn
 
 from .. import __version__
 from ..adp import Controller, Feedback, LoopResult, SafetyFilter, Supervised, simulate
-from ..adp.loop.drawing import by_generator, generated, points_of_steps
-from ..adp.loop.setup import AdpProblem
+from ..adp.loop.simulation import AdpProblem
+from ..adp.loop.step import by_generator, generated, points_of_steps
 from ..adp.planning.receding_horizon import StrainedPlans
 from ..approximation.staf import StaF
 from ..deploy import approximator, policy_of

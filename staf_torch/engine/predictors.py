@@ -12,7 +12,7 @@ from torch import Tensor
 from ..approximation.basis import StaFBasis, Target
 from ..lanes.row_objects import OfRows
 from ..numerics.checks import choice
-from ..numerics.forward_mode import use_forward_mode
+from ..numerics.derivatives import use_forward_mode
 
 PredictorInputs = tuple[Tensor, ...]
 """What a predictor prepares in bulk: tensors (B, C, ...), those of one time (B, ...)."""

@@ -12,7 +12,7 @@ from gymnasium import spaces
 
 from ..numerics.checks import fail
 from ..systems import StepPlant
-from ..systems.bounds import Limit
+from ..systems.base import Limit
 from ..systems.user_plants import Guess
 from .episodes import Numbers
 

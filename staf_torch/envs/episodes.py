@@ -16,9 +16,8 @@ from torch import Tensor
 from .. import systems
 from ..adp import Controller, Cost, Feedback, QuadraticCost
 from ..adp.loop.controller import Carried, Policy
-from ..adp.loop.drawing import points_of_steps
-from ..adp.loop.step import ClosedLoop, LoopState
-from ..adp.problem.shapes import check_problem
+from ..adp.loop.step import ClosedLoop, LoopState, points_of_steps
+from ..adp.problem.rules import check_problem
 from ..lanes.gradients import refuse_gradient
 from ..lanes.row_numbers import all_rows, over_rows
 from ..lanes.row_objects import counts_of_rows

@@ -14,8 +14,8 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from ..adp import ActorCritic, Controller, Cost, LoopResult, SafetyFilter, Supervised, simulate
-from ..adp.loop.picture import LoopAbout, picture
-from ..adp.loop.setup import AdpProblem
+from ..adp.loop.result import LoopAbout, picture
+from ..adp.loop.simulation import AdpProblem
 from ..adp.planning.shooting.reference_optimum import LoopOptimum, compare
 from ..adp.problem.held_linear import HeldLoop
 from ..figures.closed_loop import AdpHistory, draw_adp

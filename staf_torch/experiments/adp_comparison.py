@@ -13,7 +13,7 @@ from omegaconf import DictConfig, open_dict
 from torch import Tensor
 
 from ..adp import Controller, Feedback, LoopResult, RolloutPolicy
-from ..adp.loop.setup import AdpProblem
+from ..adp.loop.simulation import AdpProblem
 from ..adp.planning.shooting.reference_optimum import optimal_cost
 from ..figures.closed_loop import draw_comparison, draw_initial_weights
 from ..figures.style import draws, images

@@ -10,7 +10,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from ..adp import LQR, BoxFilter, Cost, DirectShooting, Feedback, LoopResult, QuadraticCost, SafetyFilter
-from ..adp.loop.setup import OptimumSettings
+from ..adp.loop.simulation import OptimumSettings
 from ..adp.safety.box_filter import walls
 from ..figures.closed_loop import BoxHistory, draw_box
 from ..figures.style import draws

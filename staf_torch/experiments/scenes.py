@@ -21,7 +21,7 @@ from ..systems import Units
 if TYPE_CHECKING:  # `adp` is .1 s, which chases do not need
     from ..adp import Controller, LoopResult
     from ..adp.loop.controller import Value
-    from ..adp.loop.setup import AdpProblem
+    from ..adp.loop.simulation import AdpProblem
 
 _GRID, _ACROSS = 81, 41
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..kernels import Kernel
 from ..numerics.checks import beside_batch, trailing
-from ..numerics.linalg import row_jacobian
+from ..numerics.derivatives import row_jacobian
 
 _ROWS = 4096  # rows a block: the temporaries of one stay in the inner caches
 

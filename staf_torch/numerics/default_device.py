@@ -7,7 +7,7 @@ import copy
 import functools
 import logging
 from collections.abc import Callable, Iterator
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, Self, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -141,3 +141,19 @@ def _tensors(given: tuple[object, ...]) -> Iterator[Tensor]:
 
 def _is_tensor(value: Tensor | None) -> bool:
     return value is not None
+
+
+class KeptPrecision(nn.Module):
+    """Base of modules that compute in the dtype that they were made with, whatever the caller's is.
+
+    `.float()` and `.to(dtype)` leave their tensors as they are, and those of what they hold; devices are
+    followed. A forward converts what comes and returns the caller's dtype.
+    """
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        def moved(tensor: Tensor) -> Tensor:
+            after = fn(tensor)
+            return after if after.dtype == tensor.dtype else tensor.to(after.device)
+
+        done: Any = super()._apply(moved, recurse)  # type: ignore[no-untyped-call]
+        return done  # type: ignore[no-any-return]

@@ -22,7 +22,7 @@ from ..lanes import scan
 from ..lanes.row_decisions import in_any_row, is_of_rows
 from .default_device import designed_on_cpu
 from .linalg import exponential
-from .quantiles import known_quantile
+from .rows import known_quantile
 
 TOLERANCE = 1e-6  # error of a hold or a step of a trajectory, relative to the state
 GRACE = 10.0  # times the tolerance: more steps are tried, and what is left above it is a warning

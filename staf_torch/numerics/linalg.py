@@ -1,4 +1,4 @@
-"""Batched small symmetric linear algebra, Riccati equations, and derivatives of functions of rows.
+"""Batched small symmetric linear algebra and Riccati equations.
 
 Each matrix of a batch is treated alone; none can raise for the others: what cannot be computed is NaN, or a
 rank below the size, in its own row.
@@ -6,19 +6,17 @@ rank below the size, in its own row.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ..lanes.call import seen_by_others
 from ..lanes.one_thread import alone, small_in_scipy
 from ..lanes.row_decisions import in_any_row
 from .checks import fail, non_negative, positive, vector
 from .default_device import designed_on_cpu
-from .riccati_equations import continuous_solution, discrete_gain, discrete_solution
+from .riccati import continuous_solution, discrete_gain, discrete_solution
 
 Matrix = float | Sequence[float] | Sequence[Sequence[float]] | Tensor
 
@@ -210,69 +208,6 @@ def discrete_riccati(a: Tensor, b: Tensor, paid: Tensor) -> tuple[Tensor, Tensor
         p = torch.from_numpy(solver("solve_discrete_are")(*(t.numpy() for t in (a, b, q, r)), s=s.numpy()))
     p = 0.5 * (p + p.mT)
     return p, discrete_gain(p, a, b, s, r)
-
-
-def row_jacobian(function: Callable[[Tensor], Tensor], at: Tensor) -> tuple[Tensor, Tensor]:
-    """Values and derivatives of a function of rows, in which no row sees another.
-
-    One backward pass for every entry of an output, whatever the number of rows.
-
-    Args:
-        function: (..., n) -> (..., *outputs).
-        at: (..., n), with all the leading dimensions of the values.
-
-    Returns:
-        (..., *outputs) and (..., *outputs, n).
-    """
-    values, pull = torch.func.vjp(function, at)[:2]
-    outputs = values.shape[at.dim() - 1 :]
-    if not outputs:
-        return values, pull(torch.ones_like(values))[0]
-    units = torch.eye(math.prod(outputs), dtype=values.dtype, device=values.device)
-    rows = [pull(unit.reshape(outputs).expand_as(values).contiguous())[0] for unit in units.unbind(0)]
-    return values, torch.stack(rows, dim=-2).unflatten(-2, outputs)
-
-
-def point_jacobian(function: Callable[[Tensor], Tensor], at: Tensor, count: int) -> Tensor:
-    """The derivative of a function of points at one of them, by one backward pass for all of its entries.
-
-    A tenth of the time of `torch.func.jacrev`, which is left to transforms and traces.
-
-    Args:
-        function: (..., n) -> (..., *outputs), of which no point sees another.
-        at: (n,).
-        count: of entries of an output.
-
-    Returns:
-        (*outputs, n).
-    """
-    if seen_by_others() or torch.is_inference_mode_enabled() or torch.compiler.is_compiling():
-        slopes: Tensor = torch.func.jacrev(function)(at)
-        return slopes.detach()
-    points = at.detach().expand(count, -1).clone().requires_grad_()
-    with torch.enable_grad():
-        values = function(points)
-    outputs = values.shape[1:]
-    if not values.requires_grad:
-        return torch.zeros(*outputs, len(at), dtype=values.dtype, device=values.device)
-    units = torch.eye(count, dtype=values.dtype, device=values.device).view_as(values)
-    found = torch.autograd.grad(values, points, units, materialize_grads=True)[0]
-    return found.view(*outputs, len(at))
-
-
-def slope_of(values: Tensor, at: Tensor, *, create_graph: bool = False) -> Tensor:
-    """The derivative of the sum of values with respect to ``at``: 0 where they do not depend on it.
-
-    Args:
-        values: of `torch` operations on ``at``, also of none.
-        at: with ``requires_grad``.
-        create_graph: whether the result is differentiated again; else the graph is kept for others.
-    """
-    if not values.requires_grad:
-        return torch.zeros_like(at)
-    return torch.autograd.grad(
-        values.sum(), at, retain_graph=True, create_graph=create_graph, materialize_grads=True
-    )[0]
 
 
 def exponential(matrix: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Rows of a batch: one of two values in each."""
+"""Rows of a batch: one of two values in each, and quantiles of values that are known."""
 
 from __future__ import annotations
 
@@ -18,3 +18,20 @@ def chosen(rows: Tensor, new: Some, old: Some) -> Some:
 
     picked = map(pick, new, old)
     return type(new)(*picked) if hasattr(new, "_fields") else type(new)(picked)
+
+
+def known_quantile(values: Tensor, share: float, *, lower: bool = False) -> Tensor:
+    """Return the quantile of the values that are not NaN, (P,) -> (); NaN where there are none.
+
+    Args:
+        values: at least one.
+        share: in [0, 1].
+        lower: whether to return the value below, else both neighbours are interpolated linearly.
+    """
+    ordered = values.sort().values  # NaN last
+    last = (values == values).sum() - 1
+    place = (share * last.clamp(min=0).to(values)).unsqueeze(0)
+    below = ordered.gather(0, place.floor().long())[0]
+    if lower:
+        return below
+    return torch.lerp(below, ordered.gather(0, place.ceil().long())[0], (place - place.floor())[0])

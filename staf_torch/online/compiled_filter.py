@@ -16,8 +16,7 @@ from ..lanes.compiler import compiled
 from ..lanes.when_compiled import runs_kernels, worth
 from .filter_program import KernelFilter
 from .kalman_filter import LocalFilter
-from .local_functions import LocalFunctions
-from .own_functions import OwnFunctions
+from .local_functions import LocalFunctions, OwnFunctions
 from .samples import in_place
 from .stream_state import StreamState, blocks_of
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from .compiled_filter import CompiledFilter, DirectCalls
 from .filter_program import KernelFilter
 from .kalman_filter import STREAK, LocalFilter
-from .own_functions import OwnFunctions
+from .local_functions import OwnFunctions
 from .stream_state import StreamState
 
 LEARNED_AT = (2, 5, 10, 20, 40)  # samples after which the units are learned

@@ -20,17 +20,14 @@ from ..numerics.checks import choice, fail, flag, integer, positive_real, real, 
 from ..numerics.default_device import device_of, on
 from ..signs import Sign
 from .estimator import StreamEstimator
+from .filter_program import Forecast, forecasts, log_density
 from .filter_streams import FilterStreams
-from .forecasts import Forecast, forecasts, log_density
-from .kalman_filter import LocalFilter
-from .local_functions import LocalFunctions
-from .own_functions import NAMES, OwnFunctions, has_rows, own_functions, own_law
+from .kalman_filter import LocalFilter, smooth_record
+from .local_functions import NAMES, LocalFunctions, OwnFunctions, has_rows, own_functions, own_law
 from .samples import lapses, like_given, pair, single, tensor_of
-from .smoothing import smooth_record
 from .stream_state import StreamState
-from .streams import Streams
+from .streams import Streams, TurningStreams, turned_in_time
 from .tuning import CENTERS, Tuning, tuned_streams, tuning
-from .turning_streams import TurningStreams, turned_in_time
 
 _log = logging.getLogger(__name__)
 _NAME = "StaFRegressor"

@@ -17,11 +17,10 @@ from torch import Tensor
 
 from ..kernels import GaussianKernel
 from ..numerics.default_device import designed_on_cpu
+from .filter_program import forecasts
 from .filter_streams import FilterStreams, units_of
-from .forecasts import forecasts
 from .kalman_filter import LocalFilter
-from .local_functions import LocalFunctions
-from .own_functions import OwnFunctions
+from .local_functions import LocalFunctions, OwnFunctions
 from .stream_state import StreamState
 
 _log = logging.getLogger(__name__)

@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from .. import adp
 from ..adp import LQR, Controller, Cost, Feedback, ValueBasis
-from ..adp.loop.setup import AdpProblem, OptimumSettings
+from ..adp.loop.simulation import AdpProblem, OptimumSettings
 from ..adp.near_optimal_policy import NearOptimal
 from ..adp.safety.box_filter import walls
 from ..approximation.basis import StaFBasis

@@ -3,11 +3,11 @@
 from ..numerics.registry import unlisted as _unlisted
 from ..numerics.runge_kutta import runge_kutta_step as runge_kutta_step
 from .barrier import Barrier as Barrier
+from .base import Bounds as Bounds
 from .base import ControlAffineSystem as ControlAffineSystem
 from .base import Linearisation as Linearisation
 from .base import Plant as Plant
 from .base import Units as Units
-from .bounds import Bounds as Bounds
 from .cart_pole import CartPole as CartPole
 from .clocked import Clocked as Clocked
 from .equilibria import Equilibrium as Equilibrium

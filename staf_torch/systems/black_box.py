@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..lanes.gradients import defer_gradient, marked
-from ..numerics.differences import Apart, central_slopes
+from ..numerics.derivatives import Apart, central_slopes
 from .base import Linearisation
 from .numpy_in_torch import InTorch, agrees
 

@@ -12,7 +12,7 @@ from ..lanes.gradients import refuse_gradient
 from ..lanes.row_decisions import in_any_row
 from ..lanes.row_objects import by_rows
 from ..numerics.checks import number, object_of
-from ..numerics.differences import central_slopes
+from ..numerics.derivatives import central_slopes
 from ..signs import Sign
 from .base import Plant
 

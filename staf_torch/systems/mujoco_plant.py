@@ -11,8 +11,8 @@ import numpy as np
 import torch
 
 from ..numerics.checks import fail, integer, positive_real
+from .base import Limit
 from .black_box import Numbers
-from .bounds import Limit
 from .user_plants import Guess, StepPlant
 
 _SLOPE = 1e-6  # by which `mjd_transitionFD` moves states and inputs, as its documentation advises

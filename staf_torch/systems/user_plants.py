@@ -13,9 +13,8 @@ from torch import Tensor
 from ..lanes.row_objects import by_rows
 from ..numerics.checks import fail, integer, numbers_of, positive_real, vector
 from ..numerics.default_device import beside
-from .base import Linearisation, Plant
+from .base import Bounds, Limit, Linearisation, Plant
 from .black_box import BlackBox, Motion, Slopes
-from .bounds import Bounds, Limit
 from .equilibria import find_equilibrium
 
 _log = logging.getLogger(__name__)

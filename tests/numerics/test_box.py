@@ -12,8 +12,7 @@ from torch import Tensor
 
 from staf_torch.numerics.angles import wrap
 from staf_torch.numerics.box import LARGEST, box_minimum, face_inverses
-from staf_torch.numerics.differences import central_slopes
-from staf_torch.numerics.forward_mode import jacobian
+from staf_torch.numerics.derivatives import central_slopes, jacobian
 
 
 @pytest.mark.parametrize("known", [False, True])

@@ -10,7 +10,7 @@ from helpers import random_positive_definite, tensor
 from hypothesis import given
 from hypothesis import strategies as st
 
-from staf_torch.numerics import linalg
+from staf_torch.numerics import derivatives, linalg
 from staf_torch.numerics.linalg import condition_number, exponential
 
 SEEDS = st.integers(0, 2**31)
@@ -165,7 +165,7 @@ def test_derivatives_of_a_function_of_rows_are_those_of_each_row(
     def function(x: torch.Tensor) -> torch.Tensor:
         return (x @ weights).sin().reshape((*x.shape[:-1], *outputs))
 
-    values, slopes = linalg.row_jacobian(function, at)
+    values, slopes = derivatives.row_jacobian(function, at)
     torch.testing.assert_close(values, function(at))
     want = (at @ weights).cos().unsqueeze(-1) * weights.mT
     torch.testing.assert_close(slopes, want.reshape((*lead, *outputs, 2)))

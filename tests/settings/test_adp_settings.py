@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 from torch import nn
 
 from staf_torch import adp
-from staf_torch.adp.loop.setup import AdpProblem
+from staf_torch.adp.loop.simulation import AdpProblem
 from staf_torch.settings import adp as loops
 from staf_torch.settings import config_directory
 from staf_torch.settings.adp import adp_problem

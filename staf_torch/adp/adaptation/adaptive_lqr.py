@@ -9,19 +9,48 @@ import torch
 from torch import Tensor
 
 from ...lanes.row_numbers import nonzero
-from ...numerics.checks import fail, non_negative, positive_real, real, trailing
-from ...numerics.riccati import product
+from ...numerics.checks import fail, integer, non_negative, positive_real, real, trailing
+from ...numerics.riccati import control_rate, product, riccati_residual, riccati_rows
 from ...numerics.rows import chosen
 from ..loop.controller import LQR, Controller, Policy
 from ..policies.rollout import RolloutPolicy, fitted_slope
 from ..problem.cost import Cost, matvec, quadratic
-from ..problem.rules import regulated
-from ..problem.shapes import check_objects
+from ..problem.rules import check_objects, regulated
 from .consider import Considered, ConsiderFilter
 from .least_squares import Estimate, LeastSquares
 from .parametric import ParametricPlant
-from .redesign import Redesign
 from .windows import IntegralWindows, Window
+
+_RESIDUAL = 1e-2  # residual of the Riccati equation, for the model of the moment, of a design that is used
+
+
+class Redesign:
+    """Riccati equations of rows, solved anew at every control of a loop.
+
+    Args:
+        call: whose arguments these are, for messages.
+        cost: the cost rate, without discount.
+        doublings: of a design, at least 1.
+
+    Raises:
+        ValueError: if an argument breaks its rule.
+    """
+
+    def __init__(self, call: str, cost: Cost, doublings: int) -> None:
+        if cost.discount:
+            raise fail(call, "cost", "must have no discount", cost.discount)
+        self.doublings = integer(call, "doublings", doublings, least=1)
+        self.curvature, self.r_inverse = cost.state_curvature(), cost.r_inverse
+
+    def step(self, p: Tensor, a: Tensor, b: Tensor) -> Tensor:
+        """P of the model of now, or the one before, (..., n, n), where that is not finite: A, B as in
+        `riccati_rows`."""
+        found = riccati_rows(a, b, self.curvature, self.r_inverse, doublings=self.doublings)
+        return torch.where(torch.isfinite(found).flatten(-2).all(-1)[..., None, None], found, p)
+
+    def solved(self, p: Tensor, a: Tensor, b: Tensor) -> Tensor:
+        """Return where P solves the equation of the model of now, (...) bool."""
+        return riccati_residual(p, a, control_rate(b, self.r_inverse), self.curvature) < _RESIDUAL
 
 
 class Adaptation(NamedTuple):

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ...lanes.row_objects import OfRows
 from ...numerics.checks import non_negative, one_or_each, positive
-from ...numerics.linalg import row_jacobian
+from ...numerics.derivatives import row_jacobian
 from ...numerics.riccati import product
 from ..problem.held_plant import Holding
 from .least_squares import Estimate

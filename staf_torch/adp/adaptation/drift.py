@@ -14,7 +14,7 @@ from ...lanes.row_numbers import nonzero
 from ...lanes.row_objects import OfRows
 from ...numerics.checks import fail, non_negative, positive_real, real, trailing
 from ...numerics.default_device import device_of
-from ...numerics.linalg import row_jacobian
+from ...numerics.derivatives import row_jacobian
 from ...numerics.pivoted_cholesky import newton_basis
 from ...numerics.riccati import measured, product
 from ...numerics.rows import chosen
@@ -22,8 +22,8 @@ from ...systems import ControlAffineSystem
 from ..loop.controller import LQR, Controller, Policy
 from ..problem.cost import Cost, matvec, quadratic
 from ..problem.rules import regulated
+from .adaptive_lqr import Redesign
 from .parametric import ParametricPlant
-from .redesign import Redesign
 from .windows import Equation, IntegralWindows, Window
 
 _NODES = (0.06943184420297371, 0.33000947820757187, 0.6699905217924281, 0.9305681557970262)

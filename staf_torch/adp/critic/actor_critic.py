@@ -12,8 +12,7 @@ from ...numerics.default_device import device_of
 from ...systems import ControlAffineSystem
 from ..loop.controller import Controller
 from ..problem.cost import Cost
-from ..problem.rules import regulated
-from ..problem.shapes import check_objects
+from ..problem.rules import check_objects, regulated
 from .bases import ValueBasis
 from .bellman import BellmanTerms, bellman_terms
 from .extrapolation import Extrapolation

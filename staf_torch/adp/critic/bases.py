@@ -15,7 +15,7 @@ from ...kernels import AnchoredKernel, ExponentialKernel
 from ...lanes.row_objects import OfRows
 from ...numerics.checks import choice, flag, integer, positive_real
 from ...numerics.default_device import device_of
-from ...numerics.forward_mode import jacobian
+from ...numerics.derivatives import jacobian
 
 
 class ValueBasis(nn.Module, metaclass=OfRows):

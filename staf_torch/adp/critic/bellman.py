@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from ...numerics.checks import trailing
-from ...numerics.linalg import slope_of
+from ...numerics.derivatives import slope_of
 from ...systems import ControlAffineSystem
 from ..problem.cost import Cost, matvec
-from ..problem.shapes import check_objects, check_value
+from ..problem.rules import check_objects, check_value
 from .bases import ValueBasis
 
 

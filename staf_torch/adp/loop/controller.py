@@ -24,8 +24,7 @@ from ...numerics.repr_text import limits, shown
 from ...systems import Plant
 from ..problem.cost import Cost, matvec, quadratic
 from ..problem.held_linear import held_riccati
-from ..problem.rules import regulated
-from ..problem.shapes import check_objects
+from ..problem.rules import check_objects, regulated
 
 Policy = Callable[[Tensor], Tensor]
 """u from x: (..., n) -> (..., m)."""

@@ -31,11 +31,9 @@ from ...numerics.row_checks import is_ours
 from ...systems import ControlAffineSystem, Plant
 from ..problem.cost import Cost
 from ..problem.held_plant import RESOLVED, Holding, Substeps, fewest_and_most
-from ..problem.rules import warn_if_restless, warn_if_unstable
-from ..problem.shapes import check_problem
+from ..problem.rules import check_problem, warn_if_restless, warn_if_unstable
 from .controller import Controller, Feedback
-from .drawing import by_generator
-from .step import ClosedLoop, program
+from .step import ClosedLoop, by_generator, program
 
 _ROWS = 16  # with numbers of their own, that are looked at
 _MOST = 16  # loops that are kept

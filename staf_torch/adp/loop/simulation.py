@@ -28,14 +28,12 @@ from ...signs import Sign
 from ...systems import Plant
 from ..problem.cost import Cost
 from ..problem.held_plant import Substeps
-from ..problem.shapes import check_objects
+from ..problem.rules import check_objects
 from .accuracy import hardest, needed, warn_of_errors, warn_of_models
 from .controller import Controller, Feedback, Policy
-from .drawing import generated
-from .picture import LoopAbout
 from .prepared_loop import LoopSettings, LoopTraits, PreparedLoop, key_of, known, prepared, remember
-from .result import OF_ROWS, LoopResult
-from .step import ClosedLoop, LoopState, program, record
+from .result import OF_ROWS, LoopAbout, LoopResult
+from .step import ClosedLoop, LoopState, generated, program, record
 
 _log = logging.getLogger(__name__)
 _DRAWN_AHEAD = 1024  # steps whose random numbers are drawn at once
@@ -319,3 +317,34 @@ def _seeds(seed: int | Sequence[int], batch: int) -> Sequence[int]:
         return seeds
     first = integer("simulate", "seed", seed, least=0)
     return range(first, first + batch)
+
+
+@dataclasses.dataclass(frozen=True)
+class OptimumSettings:
+    """Settings of the search for the optimum where no formula knows it."""
+
+    shooting: bool
+    states: int  # recorded states, of all trajectories together, whose V* and u* are wanted
+    horizon: float | None  # s
+    intervals: int | None
+
+
+@dataclasses.dataclass(frozen=True)
+class AdpProblem:
+    """A closed loop, checked."""
+
+    system: Plant
+    cost: Cost
+    controller: Controller
+    initial_states: Tensor  # (B, n)
+    dt: float  # s
+    steps: int
+    every: int  # steps between recorded times
+    seed: int
+    integrator: str
+    compile: bool | str
+    optimum: OptimumSettings
+
+    def with_states(self, states: Tensor) -> AdpProblem:
+        """Return the problem with other initial states (B, n)."""
+        return dataclasses.replace(self, initial_states=states)

@@ -11,8 +11,7 @@ from torch import Tensor
 from ...lanes import compiled, repeat, scan, traced_as
 from ...numerics.box import LARGEST, minimum_and_slopes
 from ...numerics.checks import fail, integer, positive_real, trailing
-from ...numerics.forward_mode import use_forward_mode
-from ...numerics.linalg import row_jacobian
+from ...numerics.derivatives import row_jacobian, use_forward_mode
 from ...numerics.riccati import product, riccati_step
 from ..loop.controller import Controller
 from ..problem.cost import QuadraticCost, matvec

@@ -25,7 +25,7 @@ from ...systems import Plant
 from ..loop.controller import Controller, Policy, Value
 from ..problem.cost import Cost
 from ..problem.held_plant import Holding
-from ..problem.shapes import check_objects
+from ..problem.rules import check_objects
 from ..safety.conditions import Constraint, check_traceable, listed
 
 _AXES = 4  # at most: their combinations are 3^k - 1

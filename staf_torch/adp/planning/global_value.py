@@ -13,8 +13,7 @@ from torch import Tensor
 from ...lanes import Program, scan
 from ...lanes.gradients import without_gradient
 from ...numerics.checks import fail, integer, positive, positive_real, trailing, vector
-from ...numerics.default_device import where_held
-from ...numerics.kept_precision import KeptPrecision
+from ...numerics.default_device import KeptPrecision, where_held
 from ..problem.rules import check_endless, check_regulator
 from ..problem.sampled import SampledProblem
 from .trajectories import LocalModel, Reference, Trajectories, around, packed, resting, unpacked

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -11,20 +12,28 @@ from torch import Tensor
 
 from ...lanes.gradients import without_gradient
 from ...lanes.opaque import opaque
+from ...lanes.row_decisions import numbers_of_rows
 from ...lanes.row_numbers import some_rows
 from ...lanes.row_objects import refuse_rows
 from ...numerics.checks import fail, integer, real
 from ...signs import Sign
+from ...systems import Plant
+from ...systems.base import spread_of
 from ..problem.sampled import SampledProblem
 from .ddp import BoxDDP
 from .global_value import GlobalValue, check_memorable, half_widths
-from .trajectories import Reference, Trajectories, chosen, rows_of
+from .trajectories import Reference, Trajectories, chosen, held_controls, rows_of
 
 _log = logging.getLogger(__name__)
 _HELD = 10  # steps for which a random first control is held
 _PREFIXES = (2, 4, 7, 11, 16, 22, 30)  # steps for which a corner of the bounds is held before a plan
 _WORTH = 0.01  # relative gain of cost for which a state's trajectory is kept
 _BEST = 3  # guesses of a state from which it is optimised
+_STEPS = (60, 480)  # of a trajectory, at least and at most
+_PROBED, _LATE = 24, 0.1  # states from which plans are tried, and the share of them that may be late
+_ARRIVED = 1e-2  # share of a trajectory's cost that may be left at its end
+_ENOUGH = 0.97  # share of fresh states known to 1 %
+_SEED = 7
 
 
 class Guesses(NamedTuple):
@@ -202,3 +211,77 @@ def _guesses(memory: GlobalValue, steps: int, x: Tensor, own: Tensor | None) -> 
         parts.append((rows, torch.cat((held, control), dim=1), state, feedback))
     owner, control, state, feedback = (torch.cat(part) for part in zip(*parts, strict=True))
     return Guesses(owner, control, Reference(state, feedback))
+
+
+def best_held(search: BoxDDP, x: Tensor) -> Trajectories:
+    """The cheapest trajectories from x (B, n) that a search reaches from the linear feedback of the goal, and
+    from each corner of the bounds, held for 2 to 30 periods before it."""
+    return held_plans(search, x, 1)[0]
+
+
+def held_plans(search: BoxDDP, x: Tensor, best: int) -> list[Trajectories]:
+    """The cheapest of these trajectories, the next ones, ...: so many."""
+    if search.problem.unregulated:  # which has several of its own
+        return [search.solve(x)]
+    begun = numbers_of_rows(lambda: held_controls(search.problem, search.steps)).numbers  # (B or 1, G, ...)
+    count, b = begun[0].shape[1], len(x)
+    control, feedback = (each.expand(b, *each.shape[1:]).transpose(0, 1).flatten(0, 1) for each in begun)
+    goal = search.problem.goals(x, search.steps)[:, :-1]
+    with some_rows(torch.arange(b, device="cpu").repeat(count)):
+        found = search.solve(x.repeat(count, 1), control, Reference(goal.repeat(count, 1, 1), feedback))
+    cost = torch.where(torch.isfinite(found.cost), found.cost, torch.inf).view(count, b)
+    order = cost.argsort(dim=0, stable=True)[:best]
+    return [rows_of(found, first * b + torch.arange(b, device="cpu")) for first in order]
+
+
+def box_of(plant: Plant, dim: int) -> Tensor:
+    """Half the width of a plant's box: its ``spread``, and of its angles all of them: (n,)."""
+    width = torch.ones(dim, dtype=torch.float64, device="cpu")
+    spread = spread_of(plant, width)
+    width *= spread if isinstance(spread, Tensor) and spread.dim() else float(spread)
+    width[list(plant.periodic)] = math.pi
+    return width
+
+
+def global_value_of(problem: SampledProblem, width: Tensor, steps: int) -> GlobalValue:
+    """The global value of a box, in seconds for two states and up to some minutes for four.
+
+    Args:
+        problem: plant, cost and bounds in steps.
+        width: half the width of the box, (n,).
+        steps: of a trajectory, to begin with: twice as many where fewer than nine of ten arrive.
+
+    Raises:
+        ValueError: if no trajectory arrives.
+    """
+    count = _enough_steps(problem, width, min(max(steps, _STEPS[0]), _STEPS[1] // 2))
+    if problem.dim > 2:
+        trajectories, rounds, candidates, lookahead = 120, 4, 48, 60
+    else:
+        trajectories, rounds, candidates, lookahead = 80, 3, 24, 40
+    return learn_global_value(
+        problem,
+        width,
+        steps=count,
+        trajectories=trajectories,
+        rounds=rounds,
+        states=100,
+        seed=_SEED,
+        candidates=candidates,
+        lookahead=lookahead,
+        enough=_ENOUGH,
+    )
+
+
+def _enough_steps(problem: SampledProblem, width: Tensor, steps: int) -> int:
+    """Steps in which nine of ten plans arrive at the goal; else the most."""
+    generator = torch.Generator().manual_seed(_SEED)
+    uniform = torch.rand(_PROBED, problem.dim, dtype=torch.float64, generator=generator, device="cpu")
+    x0 = problem.goal + width * (2 * uniform - 1)
+    while steps < _STEPS[1]:
+        found = best_held(BoxDDP(problem, steps=steps, iterations=40, tolerance=1e-5), x0)
+        late = found.value[:, -1] > _ARRIVED * found.cost
+        if float(late.double().mean()) <= _LATE:
+            break
+        steps = min(2 * steps, _STEPS[1])
+    return steps

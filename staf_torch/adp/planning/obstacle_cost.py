@@ -18,8 +18,8 @@ from ...numerics.row_checks import check_rows
 from ...signs import Sign
 from ...systems import Plant
 from ..problem.cost import QuadraticCost
+from ..problem.rules import check_objects, state_of
 from ..problem.sampled import SampledProblem
-from ..problem.shapes import check_objects, state_of
 from .ddp import BoxDDP
 from .trajectories import Reference, Trajectories, chosen, rows_of
 

@@ -12,8 +12,7 @@ from torch import Tensor
 
 from ...lanes import compiled, traced_as, where_rows
 from ...lanes.gradients import without_gradient
-from ...lanes.row_decisions import numbers_of_rows
-from ...lanes.row_numbers import over_rows, some_rows
+from ...lanes.row_numbers import over_rows
 from ...numerics.checks import fail, flag, integer, trailing
 from ...numerics.default_device import where_held
 from ..loop.controller import Controller
@@ -21,16 +20,14 @@ from ..policies.sampled_rollout import SampledRollout
 from ..problem.sampled import SampledProblem, goal_of
 from .ddp import BoxDDP
 from .global_value import GlobalValue
-from .global_value_learning import best_from
+from .global_value_learning import best_from, best_held
 from .trajectories import (
     LocalModel,
     Reference,
     Trajectories,
     around,
-    held_controls,
     packed,
     resting,
-    rows_of,
     unpacked,
 )
 
@@ -209,27 +206,6 @@ def _following(found: Trajectories) -> Following:
     """A plan of which no step is done."""
     plan = _rows(found)
     return Following(plan, torch.zeros_like(plan[:, 0, 0]))
-
-
-def best_held(search: BoxDDP, x: Tensor) -> Trajectories:
-    """The cheapest trajectories from x (B, n) that a search reaches from the linear feedback of the goal, and
-    from each corner of the bounds, held for 2 to 30 periods before it."""
-    return held_plans(search, x, 1)[0]
-
-
-def held_plans(search: BoxDDP, x: Tensor, best: int) -> list[Trajectories]:
-    """The cheapest of these trajectories, the next ones, ...: so many."""
-    if search.problem.unregulated:  # which has several of its own
-        return [search.solve(x)]
-    begun = numbers_of_rows(lambda: held_controls(search.problem, search.steps)).numbers  # (B or 1, G, ...)
-    count, b = begun[0].shape[1], len(x)
-    control, feedback = (each.expand(b, *each.shape[1:]).transpose(0, 1).flatten(0, 1) for each in begun)
-    goal = search.problem.goals(x, search.steps)[:, :-1]
-    with some_rows(torch.arange(b, device="cpu").repeat(count)):
-        found = search.solve(x.repeat(count, 1), control, Reference(goal.repeat(count, 1, 1), feedback))
-    cost = torch.where(torch.isfinite(found.cost), found.cost, torch.inf).view(count, b)
-    order = cost.argsort(dim=0, stable=True)[:best]
-    return [rows_of(found, first * b + torch.arange(b, device="cpu")) for first in order]
 
 
 class BoundedPlans:

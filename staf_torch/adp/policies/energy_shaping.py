@@ -13,7 +13,7 @@ from ...numerics.checks import fail, positive_real, trailing
 from ...systems import ControlAffineSystem
 from ..loop.controller import LQR
 from ..problem.cost import Cost
-from ..problem.shapes import check_value
+from ..problem.rules import check_value
 
 
 class EnergyShaping(nn.Module, metaclass=OfRows):

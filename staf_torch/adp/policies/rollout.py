@@ -30,7 +30,7 @@ from ...systems import Barrier, ControlAffineSystem
 from ...systems.base import spread_of
 from ..loop.controller import LQR, Policy, Value
 from ..problem.cost import Cost
-from ..problem.shapes import check_objects, check_policy, check_problem, check_value
+from ..problem.rules import check_objects, check_policy, check_problem, check_value
 
 _NAME = "a rollout policy"
 _KEPT = 64  # forms of one state that are remembered

@@ -18,14 +18,13 @@ from ...lanes.loops import repeat_counted
 from ...lanes.row_objects import Rowwise
 from ...numerics.box import LARGEST, box_minimum
 from ...numerics.checks import fail, integer, positive_real, trailing
-from ...numerics.default_device import beside, device_of
-from ...numerics.kept_precision import KeptPrecision
+from ...numerics.default_device import KeptPrecision, beside, device_of
 from ...systems import Bounds, Plant, StepPlant
 from ...systems.black_box import Numbers
 from ..loop.controller import LQR, Policy, Value
 from ..problem.cost import Cost, QuadraticCost, matvec
 from ..problem.held_plant import Holding
-from ..problem.shapes import check_policy, check_problem, check_value
+from ..problem.rules import check_policy, check_problem, check_value
 from .rollout import fitted_slope
 
 _SHARES = (1.0, 0.3)  # of the Newton step, that are tried

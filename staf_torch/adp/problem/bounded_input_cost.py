@@ -10,7 +10,7 @@ from torch import Tensor
 from ...lanes.row_decisions import in_any_row
 from ...numerics.checks import fail, one_or_each, positive
 from ...numerics.linalg import Matrix
-from ...systems.bounds import Limit
+from ...systems.base import Limit
 from .cost import Cost, pulled
 
 _EDGE = 1 - 1e-9  # of the bound, beyond which artanh is that of this share

@@ -27,7 +27,7 @@ from ...numerics.linalg import Matrix, positive_definite, positive_semidefinite,
 from ...numerics.repr_text import limits, shown, sizes
 from ...numerics.row_checks import check_rows
 from ...systems import Bounds, Plant
-from ...systems.bounds import Limit
+from ...systems.base import Limit
 from ...systems.equilibria import resting_input_at
 
 EndValue = Callable[[Tensor], Tensor]

@@ -18,7 +18,7 @@ from ...lanes.row_numbers import nonzero
 from ...lanes.row_objects import made_by_rows
 from ...numerics.checks import fail, object_of, positive_real
 from ...numerics.default_device import designed_on_cpu
-from ...numerics.differences import STEP, central_slopes
+from ...numerics.derivatives import STEP, central_slopes
 from ...numerics.exponential_step import quadratic_integral
 from ...numerics.linalg import check_modes, discrete_riccati, exponential, unstabilisable_mode
 from ...numerics.row_checks import check_rows, is_ours

@@ -28,7 +28,7 @@ from ...numerics.exponential_step import (
     exponential_step,
     fewest_steps,
 )
-from ...numerics.quantiles import known_quantile
+from ...numerics.rows import known_quantile
 from ...numerics.runge_kutta import exponential, runge_kutta_loop, stage_weights
 from ...systems import Clocked, Plant, StepPlant
 from ...systems.base import spread_of

@@ -20,17 +20,16 @@ from ...lanes.row_objects import Note, OfRows
 from ...numerics.angles import turned, unwrapped, wrap
 from ...numerics.checks import fail, integer, trailing
 from ...numerics.default_device import beside, device_of
-from ...numerics.forward_mode import use_forward_mode
+from ...numerics.derivatives import use_forward_mode
 from ...numerics.linalg import Matrix, discrete_riccati, positive_semidefinite, square, unstabilisable_mode
 from ...numerics.repr_text import limits, sizes
 from ...numerics.row_checks import check_rows, is_ours
 from ...numerics.runge_kutta import runge_kutta_mean, runge_kutta_stages
 from ...systems import Bounds, Plant
-from ...systems.bounds import Limit
+from ...systems.base import Limit
 from .cost import Cost, EndValue
 from .held_plant import Holding
-from .rules import check_torch, check_undiscounted, check_within, own_period
-from .shapes import check_objects, check_problem
+from .rules import check_objects, check_problem, check_torch, check_undiscounted, check_within, own_period
 from .tracking_cost import Path, TrackingCost
 
 StepFunction = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]

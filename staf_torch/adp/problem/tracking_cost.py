@@ -14,7 +14,7 @@ from ...numerics.checks import copied, fail
 from ...numerics.linalg import Matrix
 from ...numerics.row_checks import check_rows
 from ...systems import Clocked, Plant
-from ...systems.bounds import Limit
+from ...systems.base import Limit
 from .cost import Cost, QuadraticCost
 
 Path = Callable[[Tensor], Tensor]

@@ -19,10 +19,10 @@ from ...numerics.checks import fail, one_or_each, positive, positive_real, trail
 from ...numerics.default_device import beside, device_of
 from ...numerics.repr_text import limits, shown
 from ...systems import Bounds, Plant
-from ...systems.bounds import Limit
+from ...systems.base import Limit
 from ..loop.controller import Carried, Controller, Feedback, Policy
 from ..loop.result import LoopResult
-from ..problem.shapes import check_plant
+from ..problem.rules import check_plant
 from .conditions import Conditions, Constraint, Lean, check_traceable, listed
 from .look_ahead import LookAhead
 from .quadratic_program import cases, nearest_admissible, sides_of

@@ -78,7 +78,7 @@ INLINE V exponential(V x) {
 }
 
 #ifdef OWN
-typedef V Number;  // a stream's own, of own_functions.py
+typedef V Number;  // a stream's own, of local_functions.py
 #else
 typedef double Number;
 #endif

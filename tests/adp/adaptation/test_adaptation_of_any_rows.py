@@ -12,13 +12,12 @@ from helpers_adaptation import COST, PENDULUM
 from torch import Tensor
 
 from staf_torch import GaussianKernel, adp, rings, systems
-from staf_torch.adp.adaptation import redesign
+from staf_torch.adp.adaptation.adaptive_lqr import Redesign
 from staf_torch.adp.adaptation.history_stack import ConcurrentGradient
 from staf_torch.adp.adaptation.least_squares import Estimate
-from staf_torch.adp.adaptation.redesign import riccati_rows
 from staf_torch.adp.adaptation.windows import Equation
-from staf_torch.adp.estimation.kalman import Belief, KalmanFilter
-from staf_torch.adp.estimation.measurement import gaussian
+from staf_torch.adp.estimation import Belief, KalmanFilter, gaussian
+from staf_torch.numerics.riccati import control_rate, riccati_residual, riccati_rows
 
 ROWS = 12
 KNOWN = systems.Linear([[0.0, 1.0], [-0.4, 0.2]], [[0.0], [1.0]])
@@ -109,9 +108,9 @@ def drifts(x: Tensor, other: Tensor, u: Tensor) -> Any:
 def designed(slopes: Tensor, gains: Tensor, _: Tensor) -> Any:
     q, r = COST.q.to(slopes), COST.r.to(slopes)
     p = riccati_rows(slopes, gains, q, r, doublings=6)
-    made = redesign.Redesign("here", COST, 4)
+    made = Redesign("here", COST, 4)
     second = made.step(0 * p, slopes, gains)
-    residual = redesign.riccati_residual(p, slopes, redesign.control_rate(gains, r), q)
+    residual = riccati_residual(p, slopes, control_rate(gains, r), q)
     return p, second, residual, made.solved(second, slopes, gains)
 
 

@@ -8,9 +8,9 @@ from helpers import tensor, uniform
 from helpers_adaptation import COST, PENDULUM, TRUE
 
 from staf_torch import adp, systems
-from staf_torch.adp.adaptation.redesign import riccati_rows
 from staf_torch.adp.loop.step import ClosedLoop, program
 from staf_torch.numerics.linalg import riccati
+from staf_torch.numerics.riccati import riccati_rows
 
 WINDOWS = adp.IntegralWindows(PENDULUM, 0.1, shape="smooth", first=0.02, noise=0.01)
 LAW = adp.LeastSquares([0.2, 0.7], deviation=[0.2, 0.6], floor=1e-4, forgetting=0.1, alarm=8.0)

@@ -12,7 +12,7 @@ from helpers_adp import staf_basis
 from torch import Tensor
 
 from staf_torch import adp, systems
-from staf_torch.numerics.forward_mode import use_forward_mode
+from staf_torch.numerics.derivatives import use_forward_mode
 from staf_torch.systems.two_state_tracking import desired_rate, true_parameters
 
 use_forward_mode()

@@ -8,9 +8,9 @@ from helpers import tensor, uniform
 from helpers_adaptation import COST, PENDULUM
 
 from staf_torch import adp, systems
-from staf_torch.adp.adaptation import redesign
-from staf_torch.adp.adaptation.redesign import riccati_rows
-from staf_torch.adp.estimation.kalman import Belief
+from staf_torch.adp.adaptation.adaptive_lqr import Redesign
+from staf_torch.adp.estimation import Belief
+from staf_torch.numerics.riccati import riccati_rows
 
 
 def test_a_plant_changes_when_its_clock_has_run_down() -> None:
@@ -38,7 +38,7 @@ def test_the_cost_of_a_changing_plant_is_that_of_its_state() -> None:
 
 def test_a_design_that_went_wrong_keeps_the_one_before() -> None:
     q, r = torch.eye(2).double(), torch.eye(1).double()
-    made = redesign.Redesign("here", COST, 6)
+    made = Redesign("here", COST, 6)
     a, b = uniform(2, 2, 2, seed=1), uniform(2, 2, 1, seed=2)
     good = made.step(torch.zeros(2, 2, 2).double(), a, b)
     torch.testing.assert_close(good, riccati_rows(a, b, q, r, doublings=6), rtol=0, atol=0)

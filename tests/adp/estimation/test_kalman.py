@@ -10,7 +10,7 @@ from torch import Tensor
 
 from staf_torch import adp, systems
 from staf_torch.adp.adaptation.least_squares import Estimate
-from staf_torch.adp.estimation.kalman import Belief, KalmanFilter
+from staf_torch.adp.estimation import Belief, KalmanFilter
 from staf_torch.adp.loop.step import ClosedLoop, program
 
 LINEAR = systems.Linear([[0.0, 1.0, 0.0], [2.0, -0.5, 1.0], [0.0, 0.3, -1.0]], [[0.0], [1.0], [0.5]])

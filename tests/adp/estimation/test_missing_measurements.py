@@ -14,7 +14,7 @@ from torch import Tensor
 
 from staf_torch import GaussianKernel, adp, rings, systems
 from staf_torch.adp.adaptation.windows import Equation
-from staf_torch.adp.estimation.kalman import Belief, KalmanFilter
+from staf_torch.adp.estimation import Belief, KalmanFilter
 from staf_torch.adp.loop.controller import Carried
 
 KINDS = (adp.ExtendedKalman, adp.UnscentedKalman)

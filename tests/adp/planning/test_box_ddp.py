@@ -14,7 +14,7 @@ from torch import Tensor
 
 from staf_torch import adp, lanes, systems
 from staf_torch.adp.planning.trajectories import Reference, rows_of
-from staf_torch.numerics.forward_mode import use_forward_mode
+from staf_torch.numerics.derivatives import use_forward_mode
 
 use_forward_mode()
 

@@ -12,7 +12,7 @@ from helpers import uniform
 from torch import Tensor
 
 from staf_torch import adp, systems
-from staf_torch.adp.loop.setup import AdpProblem, OptimumSettings
+from staf_torch.adp.loop.simulation import AdpProblem, OptimumSettings
 from staf_torch.adp.planning.shooting.reference_optimum import compare, known_value, optima, optimal_cost
 
 PLANT = systems.Linear([[0.0, 1.0], [2.0, -1.0]], [[0.0], [1.0]])

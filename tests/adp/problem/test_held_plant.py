@@ -14,7 +14,7 @@ from torch import Tensor
 from staf_torch import adp, systems
 from staf_torch.adp.policies.sampled_rollout import followed
 from staf_torch.adp.problem.held_plant import Holding, fewest_and_most
-from staf_torch.numerics.forward_mode import use_forward_mode
+from staf_torch.numerics.derivatives import use_forward_mode
 
 use_forward_mode()
 

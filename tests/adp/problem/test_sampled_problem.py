@@ -15,7 +15,7 @@ from torch import Tensor
 
 from staf_torch import adp, lanes, systems
 from staf_torch.adp.planning.trajectories import LocalModel
-from staf_torch.numerics.forward_mode import use_forward_mode
+from staf_torch.numerics.derivatives import use_forward_mode
 
 INF = math.inf
 use_forward_mode()

@@ -16,26 +16,25 @@ from ....numerics.default_device import beside, on_cpu
 from ....numerics.linalg import Matrix
 from ....signs import Sign
 from ....systems import ControlAffineSystem, Linear, Plant
-from ....systems.bounds import Limit
+from ....systems.base import Limit
 from ...loop.controller import LQR, Policy, Value
 from ...problem.bounded_input_cost import BoundedInputCost
 from ...problem.cost import Cost, QuadraticCost
 from ...problem.rules import (
+    check_objects,
+    check_policy,
+    check_problem,
     check_still,
     check_torch,
     check_undiscounted,
     restless,
     set_point,
 )
-from ...problem.shapes import check_objects, check_policy, check_problem
 from ..trajectories import Trajectories, chosen
-from .best_of_starts import ROWS, cheapest, dearer, joined, merged, replaced, selected
-from .defaults import MOST, end_value, regulator, times
-from .mesh import graded, halved, split
+from .mesh import MOST, end_value, graded, halved, regulator, split, times
 from .newton import Interval, MeshPlan, NewtonSolution, follow, minimise, replay, why_none
 from .optimum import Optimum
-from .plan_search import PlanSearch
-from .starts import guesses, guided
+from .starts import ROWS, PlanSearch, cheapest, dearer, guesses, guided, joined, merged, replaced, selected
 
 _GAP = 1e-3  # share of the value by which a stationary control may miss the minimum of the Hamiltonian
 _NEAR = (0.5, 2.0)  # value over the LQR's, inside which one start is believed,

@@ -1,17 +1,30 @@
-"""Meshes of times, and a plan on one of half the intervals."""
+"""Meshes of times, and the defaults of direct shooting: regulator, end of a plan, horizon, intervals."""
 
 from __future__ import annotations
 
+import logging
 import math
 
 import torch
 from torch import Tensor
 
+from ....lanes.row_decisions import decided, numbers_of_rows
+from ....lanes.row_numbers import over_rows
+from ....lanes.row_objects import made_by_rows
+from ....numerics.checks import fail, integer, positive_real
+from ....numerics.linalg import Matrix, positive_semidefinite, square
 from ....systems import Plant
-from ...loop.controller import LQR
+from ...loop.controller import LQR, Value
+from ...problem.cost import Cost, quadratic
+from ...problem.rules import check_regulates, check_value
 from .newton import Interval, MeshPlan
 
 _GRADING = 6.0  # ratio of a mesh's last interval to the first
+_log = logging.getLogger(__name__)
+_DECAY = 9.2  # time constants of the slowest mode in the horizon: it falls to 1e-4
+_RESOLVED = 0.5  # mean interval in time constants of the fastest mode
+_LEAST = 80  # intervals
+MOST = 120  # intervals that are chosen at most where inputs are bounded
 
 
 def graded(horizon: float, intervals: int) -> Tensor:
@@ -57,3 +70,78 @@ def rates_of(system: Plant, lqr: LQR) -> tuple[Tensor, Tensor]:
     a, b = system.linearisation(lqr.cost.target, lqr.cost.target_input)
     modes = torch.linalg.eigvals(a.to(lqr.p) - b.to(lqr.p) @ lqr.k)
     return -modes.real.max(), modes.abs().max()
+
+
+def regulator(system: Plant, cost: Cost, horizon: float | None, ends: bool) -> LQR | None:
+    """The LQR of a problem; None where there is none and a horizon does without.
+
+    Args:
+        system: the plant.
+        cost: the cost rate, around the plant.
+        horizon: s, as it was given.
+        ends: whether a plan would end with its value.
+
+    Raises:
+        ValueError: if there is neither an LQR nor a horizon.
+    """
+    try:
+        decided(lambda: check_regulates("DirectShooting", system, cost))
+        return LQR(system, cost)
+    except ValueError as error:
+        why = str(error)
+    if horizon is None:
+        raise ValueError(
+            f"`DirectShooting(horizon=...)` must be given, in s, where there is no LQR: {why} "
+            "Give a `terminal` as well, V_T of x or S of e'Se, where the end is to count."
+        )
+    if ends:
+        _log.warning(
+            "`DirectShooting` has no LQR (%s): the end of a plan costs nothing: give `terminal`, V_T of x"
+            " or S of e'Se, or a horizon after which nothing counts.",
+            why,
+        )
+    return None
+
+
+def end_value(terminal: Value | Matrix | None, cost: Cost, lqr: LQR | None) -> Value:
+    """V_T: as given, of the cost, of the LQR, or nothing."""
+    if terminal is None:
+        if cost.ending is not None:
+            return cost.terminal
+        return (lambda x: torch.zeros_like(x[..., 0])) if lqr is None else lqr.value
+    if callable(terminal):
+        own = check_value("DirectShooting", "terminal", terminal, cost)
+    else:
+
+        def checked() -> Tensor:
+            end = square("DirectShooting", "terminal", terminal, cost.dim)
+            return positive_semidefinite("DirectShooting", "terminal", end, cost.dim)
+
+        end = made_by_rows(checked)
+
+        def own(x: Tensor) -> Tensor:
+            return quadratic(end, cost.deviation(x))
+
+    return lambda x: over_rows(own, x)
+
+
+def times(
+    system: Plant, cost: Cost, lqr: LQR | None, horizon: float | None, intervals: int | None
+) -> tuple[float, int]:
+    """The horizon, s, and the even number of its intervals, checked.
+
+    Raises:
+        ValueError: if one of them breaks its rule.
+    """
+    slowest, fastest = 1.0, 0.0
+    if lqr is not None:
+        slow, fast = numbers_of_rows(lambda: rates_of(system, lqr)).numbers
+        slowest, fastest = float(slow.min()), float(fast.max())
+    horizon = positive_real("DirectShooting", "horizon", _DECAY / slowest if horizon is None else horizon)
+    if intervals is None:
+        most = math.inf if cost.bounds is None else MOST
+        intervals = 2 * round(0.5 * min(max(_LEAST, horizon * fastest / _RESOLVED), most))
+    intervals = integer("DirectShooting", "intervals", intervals, least=4)
+    if intervals % 2:
+        raise fail("DirectShooting", "intervals", "must be even", intervals)
+    return horizon, intervals

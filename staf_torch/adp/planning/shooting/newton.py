@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from ....lanes.row_numbers import over_rows
-from ....numerics.linalg import row_jacobian, slope_of
+from ....numerics.derivatives import row_jacobian, slope_of
 from ....numerics.riccati import riccati_step
 from ....numerics.runge_kutta import SHARES, runge_kutta_mean, runge_kutta_stages, runge_kutta_step
 from ....systems import ControlAffineSystem, Plant

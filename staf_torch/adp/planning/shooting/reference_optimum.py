@@ -12,7 +12,7 @@ from torch import Tensor
 from ....systems import ControlAffineSystem
 from ...critic.bellman import value_gradient
 from ...loop.result import LoopResult
-from ...loop.setup import AdpProblem
+from ...loop.simulation import AdpProblem
 from ...problem.cost import QuadraticCost
 from .direct import DirectShooting
 

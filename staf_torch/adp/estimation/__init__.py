@@ -1,1 +1,0 @@
-"""Control what is measured with noise: outputs, Kalman filters."""
