@@ -156,14 +156,8 @@ class KalmanFilter(metaclass=OfRows):
         self.periods = tuple(2 * math.pi if k in angles else found[k] for k in range(q))
 
     def step(self, belief: Belief, y: Tensor, dt: float, first: Tensor) -> Belief:
-        """The belief after ``dt`` seconds with the input held, and the measurement y (..., q) then.
-
-        Args:
-            belief: after the measurement before.
-            y: measured now.
-            dt: s.
-            first: (...) bool: whether y is the first measurement, for which no time has passed.
-        """
+        """Return the belief after ``dt`` seconds with the input held, and the measurement y (..., q)
+        then; no time has passed in rows whose ``first`` (...), bool, it is."""
         moved = self.predicted(belief, dt)
         mean = torch.where(first.unsqueeze(-1), belief.mean, moved.mean)
         covariance = torch.where(first[..., None, None], belief.covariance, moved.covariance)
@@ -385,13 +379,8 @@ class Observed(Controller):
 def _mean(
     points: Tensor, weights: Tensor, apart: Callable[[Tensor, Tensor], Tensor]
 ) -> tuple[Tensor, Tensor]:
-    """The weighted mean (..., k) of points (..., P, k), and what each is away from it.
-
-    Args:
-        points: the first of them in the middle.
-        weights: (P, 1).
-        apart: the difference of two, by the shorter way around.
-    """
+    """Return the weighted mean (..., k) of points (..., P, k), the first of them in the middle, and what
+    each is away from it; weights (P, 1), ``apart`` the difference of two by the shorter way around."""
     middle = points[..., :1, :]
     away = apart(points, middle)
     off = (weights * away).sum(-2, keepdim=True)

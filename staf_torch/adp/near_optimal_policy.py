@@ -54,12 +54,6 @@ class NearOptimal(SampledRollout):
     Attributes:
         reach: which of the two, and how far it led on a sample of the box.
         memory: the global value; None where the LQR and its rollouts are enough.
-
-    Args:
-        basis: as in `SampledRollout`, and so are ``plant``, ``steps`` and ``substeps``.
-        lqr: the base, made for the period for which a control is held.
-        radius: of the ball of centers, in units of the state.
-        plan: whether to plan where the LQR would meet a bound.
     """
 
     largest = ("steps",)
@@ -68,12 +62,12 @@ class NearOptimal(SampledRollout):
         self,
         basis: StaFBasis,
         plant: Plant,
-        lqr: LQR,
+        lqr: LQR,  # the base, made for the period for which a control is held
         *,
         steps: int,
         substeps: int | None,
-        radius: float,
-        plan: bool,
+        radius: float,  # of the ball of centers, in units of the state
+        plan: bool,  # whether to plan where the LQR would meet a bound
     ) -> None:
         assert lqr.period is not None
         settings = {"period": lqr.period, "steps": steps, "substeps": substeps}

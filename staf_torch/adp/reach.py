@@ -102,15 +102,7 @@ class Looked(NamedTuple):
 
 
 def looked(policy: SampledRollout, lqr: LQR, box: Tensor, settles: Tensor, way: str) -> Looked | None:
-    """Follow a base from a sample of the box; None where it regulates all by nature.
-
-    Args:
-        policy: with the base.
-        lqr: the base itself.
-        box: half widths, (n,).
-        settles: periods after which the slowest mode of the base has fallen to 1e-4, ().
-        way: ``auto`` or ``global``.
-    """
+    """Follow a base from a sample of the box; None where it regulates all by nature."""
     x0, widths = sample(policy.cost, box), tuple(box.tolist())
     if type(policy.plant) is Linear and not policy.bounds.present and way == "auto":
         return None
@@ -134,13 +126,6 @@ def extended(
     policy: SampledRollout, lqr: LQR, box: Tensor, settles: int, way: str
 ) -> tuple[Reach, GlobalValue | None]:
     """Return the reach of a base and, where that is not enough, of a global value; log what is left.
-
-    Args:
-        policy: with the base.
-        lqr: the base itself.
-        box: half widths, (n,).
-        settles: periods after which the slowest mode of the base has fallen to 1e-4.
-        way: ``auto`` or ``global``.
 
     Raises:
         ValueError: if the way is ``global`` and there is no global value.
@@ -203,13 +188,8 @@ class Followed(NamedTuple):
 
 @torch.no_grad()
 def follow_base(policy: SampledRollout, x0: Tensor, periods: Tensor) -> Followed:
-    """Follow the base of a policy, within its bounds, from x0 (B, n), for 0.4 s of computing at most.
-
-    Args:
-        policy: with the base.
-        x0: (B, n).
-        periods: at most, ().
-    """
+    """Follow the base of a policy, within its bounds, from x0 (B, n), for ``periods`` () at most and 0.4
+    s of computing."""
     x, paid, began, since = x0, torch.zeros_like(x0[:, 0]), time.thread_time(), time.monotonic()
     good = torch.zeros_like(paid, dtype=torch.bool)
     known, k = good[0], 0
@@ -234,11 +214,8 @@ def follow_base(policy: SampledRollout, x0: Tensor, periods: Tensor) -> Followed
 
 
 def sampled_problem(plant: Plant, cost: Cost, period: float, x: Tensor) -> SampledProblem:
-    """The plant and its cost in steps, as a global value needs them. x (B, n) are states of the box.
-
-    Raises:
-        ValueError: that says why there is none.
-    """
+    """Return the plant and its cost in steps, as a global value needs them; x (B, n) are states of the
+    box. Raises a ValueError that says why there is none."""
     if isinstance(plant, FunctionPlant):
         levels = Bounds(-1.0, 1.0, cost.inputs) if cost.bounds is None else cost.bounds
         at = torch.linspace(0, 1, len(x), dtype=torch.float64, device=x.device).unsqueeze(1)

@@ -13,14 +13,8 @@ _SAME = 1e-6  # relative, of two changes that are one
 
 
 def wrap(difference: Tensor, periodic: Sequence[int]) -> Tensor:
-    """The difference with its periodic coordinates in [-pi, pi]: (..., n) -> (..., n).
-
-    Where it lies there already, not a bit of it changes.
-
-    Args:
-        difference: of two states, in rad where periodic.
-        periodic: the coordinates that are angles; a negative index counts from the end.
-    """
+    """Return the difference of two states with its periodic coordinates (rad; negative indices count from
+    the end) in [-pi, pi]: (..., n) -> (..., n). Where it lies there already, not a bit of it changes."""
     if not periodic:
         return difference
     size = difference.shape[-1]
@@ -50,12 +44,8 @@ def unwrapped(x: Tensor, periodic: Sequence[int]) -> Tensor:
 
 
 def wrap_each(difference: Tensor, periods: Sequence[float]) -> Tensor:
-    """The difference with every entry k in half a period around 0: (..., q) -> (..., q).
-
-    Args:
-        difference: of two outputs.
-        periods: q numbers in the units of the outputs, 0 for one that has none: see `periods_of`.
-    """
+    """Return the difference of two outputs, entry k within half a period around 0, periods q numbers in
+    the units of the outputs, 0 for one that has none (`periods_of`): (..., q) -> (..., q)."""
     if not any(periods):
         return difference
     entries = zip(difference.unbind(-1), periods, strict=True)
@@ -63,14 +53,9 @@ def wrap_each(difference: Tensor, periods: Sequence[float]) -> Tensor:
 
 
 def periods_of(output: Callable[[Tensor], Tensor], dim: int, periodic: Sequence[int]) -> tuple[float, ...]:
-    """By how much every output changes as a periodic coordinate goes around once: q numbers, 0 where none
-    does by the same amount everywhere. Of two coordinates it is what both are multiples of.
-
-    Args:
-        output: (B, n) -> (B, q), float64.
-        dim: n.
-        periodic: the coordinates that are angles in rad.
-    """
+    """Return by how much every output changes as a periodic coordinate goes around once: q numbers, 0
+    where none does by the same amount everywhere. Of two coordinates it is what both are multiples of.
+    The output is (B, n) -> (B, q), float64."""
     generator = torch.Generator().manual_seed(0)
     x = torch.randn(_PROBES, dim, dtype=torch.float64, generator=generator, device="cpu")
     with torch.no_grad():

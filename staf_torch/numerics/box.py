@@ -18,14 +18,8 @@ def faces(count: int) -> Tensor:
 
 
 def face_inverses(curvature: Tensor) -> Tensor:
-    """Return, for every face, the inverse of the curvature of the free unknowns, 0 in the others.
-
-    Args:
-        curvature: H, (..., m, m), symmetric positive definite.
-
-    Returns:
-        (..., 3^m, m, m).
-    """
+    """Return, for every face, the inverse of the curvature of the free unknowns, 0 in the others: H (...,
+    m, m), symmetric positive definite, -> (..., 3^m, m, m)."""
     free = (faces(curvature.shape[-1]) == _FREE).to(curvature)
     both = free.unsqueeze(-1) * free.unsqueeze(-2)
     fixed = torch.diag_embed(1 - free)
@@ -36,20 +30,12 @@ def face_inverses(curvature: Tensor) -> Tensor:
 def box_minimum(
     curvature: Tensor, slope: Tensor, low: Tensor, high: Tensor, inverses: Tensor | None = None
 ) -> Tensor:
-    """Return argmin of u'Hu / 2 + c'u over low <= u <= high, exactly.
+    """Return argmin of u'Hu / 2 + c'u over low <= u <= high, exactly: H (..., m, m), symmetric positive
+    definite, m at most 4; c and the limits (..., m), infinite for none -> (..., m), NaN where c or H is.
 
     The minimum of one unknown is clipped. For more, the minima of the 3^m faces, clipped, are compared: that
-    of the right face is among them, and no other can be lower.
-
-    Args:
-        curvature: H, (..., m, m), symmetric positive definite, m at most 4.
-        slope: c, (..., m).
-        low: (..., m); -inf for none.
-        high: (..., m); inf for none.
-        inverses: of `face_inverses(curvature)`, where H is known beforehand.
-
-    Returns:
-        (..., m); NaN where the slope or the curvature is.
+    of the right face is among them, and no other can be lower. ``inverses`` are those of `face_inverses`,
+    where H is known beforehand.
 
     Raises:
         ValueError: if m is larger than 4.
@@ -95,13 +81,8 @@ def minimum_and_slopes(
 
 
 def slopes_of_minimum(hessian: Tensor, cross: Tensor, free: Tensor) -> Tensor:
-    """du/dx of the minimum of u'Hu/2 + (s + C x)'u over a box: (B, m, n), 0 for inputs at a bound.
-
-    Args:
-        hessian: H, (B, m, m).
-        cross: C, (B, m, n).
-        free: whether an input lies between its bounds, (B, m) bool.
-    """
+    """du/dx of the minimum of u'Hu/2 + (s + C x)'u over a box, 0 for inputs at a bound: H (B, m, m), C
+    (B, m, n), ``free`` (B, m) bool -> (B, m, n)."""
     share = free.to(hessian)
     masked = hessian * share.unsqueeze(-1) * share.unsqueeze(-2) + torch.diag_embed(1 - share)
     inverse = 1 / masked if masked.shape[-1] == 1 else torch.linalg.inv(masked)

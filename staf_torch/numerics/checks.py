@@ -98,14 +98,8 @@ def fails(rule: Tensor) -> bool:
 
 
 def own_number(call: str, name: str, value: object, sign: str = "any") -> Any:
-    """Return a finite number, or a tensor of one: of `rows`, one a row.
-
-    Args:
-        call: in whose name an error speaks.
-        name: of the argument.
-        value: a number, or a tensor without dimensions.
-        sign: ``positive``, ``not negative`` or ``any``.
-    """
+    """Return a finite number, or a tensor of one without dimensions, of `rows` one a row; its sign
+    ``positive``, ``not negative`` or ``any``."""
     if type(value) is float and 0 < value < math.inf:
         return value
     checked = number(call, name, value)
@@ -137,17 +131,8 @@ def integer(call: str, name: str, value: object, least: int) -> int:
 
 
 def object_of(call: str, kind: type, else_write: str = "", **given: object) -> None:
-    """Refuse what is no object of a class: the class itself, a function, a name, None.
-
-    Args:
-        call: the door.
-        kind: the class.
-        else_write: how one is made of what is often given instead.
-        given: its arguments by name.
-
-    Raises:
-        ValueError: that names the first one.
-    """
+    """Refuse what is no object of a class: the class itself, a function, a name, None; the first such
+    argument by its name, with how one is made of what is often given instead."""
     for name, value in given.items():
         if isinstance(value, kind):
             continue
@@ -226,23 +211,15 @@ def trailing(
     call: str,
     name: str,
     value: object,
-    dims: int,
-    last: int | None = None,
+    dims: int,  # at least
+    last: int | None = None,  # size of the last dimension
     *,
-    meta: bool = True,
-    vmap: bool = True,
+    meta: bool = True,  # whether a tensor without numbers will do
+    vmap: bool = True,  # whether one of `torch.func.vmap` will do
 ) -> Tensor:
     """The one rule of states and all that comes in rows: a floating-point tensor, dense, of the right size.
 
     Numbers of another kind are never rounded or converted without a word: the error says what to write.
-
-    Args:
-        call: the door, and so is ``name`` its argument.
-        value: what was given.
-        dims: it must have at least.
-        last: size of its last dimension, where one is stated.
-        meta: whether a tensor without numbers will do.
-        vmap: whether one of `torch.func.vmap` will do.
     """
     if isinstance(value, Tensor):
         if value.dtype not in _FLOATS or value.layout is not _DENSE:
@@ -279,16 +256,8 @@ def trailing(
 
 
 def beside_batch(call: str, name: str, value: Tensor, dims: int, batch: Sequence[int], of: str) -> None:
-    """Refuse a tensor whose sizes before its last ``dims`` do not broadcast with those of a batch.
-
-    Args:
-        call: the door.
-        name: of the argument.
-        value: what was given.
-        dims: of it that belong to no batch.
-        batch: the sizes.
-        of: what has them, for the message.
-    """
+    """Refuse a tensor whose sizes before its last ``dims`` do not broadcast with those of a batch; ``of``
+    says in the message what has these."""
     leading = value.shape[: value.dim() - dims]
     pairs = zip(reversed(leading), reversed(batch), strict=False)
     if leading != batch and not all(size == other or size == 1 or other == 1 for size, other in pairs):
@@ -301,15 +270,8 @@ def _counted(sizes: Sequence[int]) -> str:
 
 
 def states(holder: object, name: str, x: Tensor, last: int | None = None) -> Tensor:
-    """Return states that are floating-point numbers, refused by `trailing` otherwise; for methods that are
-    called at every stage of a step.
-
-    Args:
-        holder: whose class is the door.
-        name: of the argument.
-        x: what was given.
-        last: as in `trailing`.
-    """
+    """Return states that are floating-point numbers, refused by `trailing` otherwise, in the name of the
+    holder's class; for methods that are called at every stage of a step."""
     if type(x) is Tensor and x.is_floating_point():  # in half the time of a look at its dtype
         return x
     return trailing(type(holder).__name__, name, x, 1, last)
@@ -359,18 +321,11 @@ def hold(module: nn.Module, name: str, value: Tensor) -> Tensor:
 
 
 def kept(module: nn.Module, name: str, *, zero: bool = False, squared: bool = False) -> Tensor:
-    """Return a hyperparameter of `hold`, and refuse a learned one that training has taken out of its rule.
+    """Return a hyperparameter of `hold`, and refuse a learned one that training has taken out of its rule:
+    positive and finite, with ``zero`` not negative, with ``squared`` its square positive in the precision
+    that it has.
 
     A fixed one was checked when it was given. Inside `torch.compile` the check is an assertion.
-
-    Args:
-        module: that holds it.
-        name: of the hyperparameter.
-        zero: whether zero is allowed too.
-        squared: whether its square must be positive too, in the precision that it has.
-
-    Raises:
-        ValueError: if a learned one is not positive (with ``zero``: is negative), or not finite.
     """
     fixed = module._buffers.get(name)
     if fixed is not None and not fixed.requires_grad:

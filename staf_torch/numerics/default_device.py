@@ -86,13 +86,8 @@ def designed_on_cpu(function: Callable[Given, Found]) -> Callable[Given, Found]:
 def where_held(
     call: str, held: Callable[[Any], Tensor]
 ) -> Callable[[Callable[Given, Found]], Callable[Given, Found]]:
-    """Decorate a method that computes where its object is: tensors of another device are moved there, what
-    it returns back, and that is logged once.
-
-    Args:
-        call: the method, for the log.
-        held: a tensor of the object.
-    """
+    """Decorate a method, of this name in the log, that computes where a tensor of its object is: tensors
+    of another device are moved there, what it returns back, and that is logged once."""
 
     def decorated(method: Callable[Given, Found]) -> Callable[Given, Found]:
         @functools.wraps(method)

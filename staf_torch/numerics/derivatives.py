@@ -22,21 +22,12 @@ Apart = Callable[[Tensor, Tensor], Tensor]
 
 def central_slopes(
     function: Callable[[Tensor], Tensor],
-    at: Tensor,
-    scale: Tensor | None = None,
-    apart: Apart = operator.sub,
+    at: Tensor,  # (n,), float64
+    scale: Tensor | None = None,  # (n,) of the unknowns: a step is 6e-6 of it; None for max(1, |at|)
+    apart: Apart = operator.sub,  # the difference of two values, (B, k), (B, k) -> (B, k)
 ) -> Tensor:
-    """The Jacobian of a batched function at one point, from 2n rows in one call.
-
-    Args:
-        function: (B, n) -> (B, k).
-        at: (n,), float64.
-        scale: (n,), positive, of the unknowns: a step is 6e-6 of it; by default max(1, |at|).
-        apart: the difference of two values, (B, k), (B, k) -> (B, k).
-
-    Returns:
-        (k, n).
-    """
+    """Return the Jacobian (k, n) of a batched function (B, n) -> (B, k) at one point, from 2n rows in one
+    call."""
     size = at.abs().clamp(min=1.0) if scale is None else scale
     steps = torch.diag(STEP * size)
     probes = torch.cat((at + steps, at - steps))
@@ -46,17 +37,9 @@ def central_slopes(
 
 
 def row_jacobian(function: Callable[[Tensor], Tensor], at: Tensor) -> tuple[Tensor, Tensor]:
-    """Values and derivatives of a function of rows, in which no row sees another.
-
-    One backward pass for every entry of an output, whatever the number of rows.
-
-    Args:
-        function: (..., n) -> (..., *outputs).
-        at: (..., n), with all the leading dimensions of the values.
-
-    Returns:
-        (..., *outputs) and (..., *outputs, n).
-    """
+    """Return values (..., *outputs) and derivatives (..., *outputs, n) of a function of rows, in which no
+    row sees another, at (..., n): one backward pass for every entry of an output, whatever the number of
+    rows."""
     values, pull = torch.func.vjp(function, at)[:2]
     outputs = values.shape[at.dim() - 1 :]
     if not outputs:
@@ -67,17 +50,10 @@ def row_jacobian(function: Callable[[Tensor], Tensor], at: Tensor) -> tuple[Tens
 
 
 def point_jacobian(function: Callable[[Tensor], Tensor], at: Tensor, count: int) -> Tensor:
-    """The derivative of a function of points at one of them, by one backward pass for all of its entries.
+    """Return the derivative (*outputs, n) of a function of points (..., n) -> (..., *outputs) at one of them
+    (n,), by one backward pass for all ``count`` entries of an output.
 
     A tenth of the time of `torch.func.jacrev`, which is left to transforms and traces.
-
-    Args:
-        function: (..., n) -> (..., *outputs), of which no point sees another.
-        at: (n,).
-        count: of entries of an output.
-
-    Returns:
-        (*outputs, n).
     """
     if seen_by_others() or torch.is_inference_mode_enabled() or torch.compiler.is_compiling():
         slopes: Tensor = torch.func.jacrev(function)(at)
@@ -94,13 +70,8 @@ def point_jacobian(function: Callable[[Tensor], Tensor], at: Tensor, count: int)
 
 
 def slope_of(values: Tensor, at: Tensor, *, create_graph: bool = False) -> Tensor:
-    """The derivative of the sum of values with respect to ``at``: 0 where they do not depend on it.
-
-    Args:
-        values: of `torch` operations on ``at``, also of none.
-        at: with ``requires_grad``.
-        create_graph: whether the result is differentiated again; else the graph is kept for others.
-    """
+    """Return the derivative of the sum of values by ``at``: 0 where they do not depend on it. With
+    ``create_graph`` it is differentiated again; else the graph is kept for others."""
     if not values.requires_grad:
         return torch.zeros_like(at)
     return torch.autograd.grad(

@@ -45,14 +45,9 @@ class ExponentialStep(NamedTuple):
 
 
 def quadratic_integral(matrix: Tensor, rate: Tensor, length: float) -> tuple[Tensor, Tensor]:
-    """Return e^(M t) and int_0^t e^(M s)' R e^(M s) ds, (n, n) float64 each.
+    """Return e^(M t) and int_0^t e^(M s)' R e^(M s) ds, (n, n) float64 each, R symmetric.
 
     The exponential of a short step is doubled: e^(M 2h) = (e^(M h))^2, W(2h) = W(h) + e^(M h)' W(h) e^(M h).
-
-    Args:
-        matrix: M, (n, n).
-        rate: R, (n, n), symmetric.
-        length: t, s.
 
     Source: Van Loan, "Computing integrals involving the matrix exponential", IEEE TAC 23 (1978).
     """
@@ -76,14 +71,8 @@ def quadratic_integral(matrix: Tensor, rate: Tensor, length: float) -> tuple[Ten
 def exponential_step(
     linear: Tensor, h: float, curvature: Tensor | None = None, discount: float = 0.0
 ) -> ExponentialStep:
-    """Return the matrices of steps of length h.
-
-    Args:
-        linear: A, (n, n), 1/s.
-        h: s.
-        curvature: Q of a cost rate d'Qd that is to be integrated exactly, (n, n); None for none.
-        discount: rho, 1/s, of that integral.
-    """
+    """Return the matrices of steps of h seconds for A (n, n), 1/s; with Q (n, n) those of the integral of
+    d'Qd, discounted by rho, 1/s."""
     a = linear.double()
     n, zero = len(a), torch.zeros_like(a)
     (one, two, three), (half_one, half_two, _) = _phi(a, h), _phi(a, 0.5 * h)
@@ -133,13 +122,9 @@ def times(matrix: Tensor, x: Tensor) -> Tensor:
 def exponential_stages(
     table: ExponentialStep, field: Callable[[Tensor], tuple[Tensor, Tensor]], x: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Take one step: the displacement (..., n), N (4, ..., n) and what else the field gives (4, ...).
-
-    Args:
-        table: of the length and the plant.
-        field: x' and another number at a displacement from x, (..., n) -> (..., n), (...).
-        x: (..., n), for its shape, dtype and device.
-    """
+    """Take one step from x (..., n), read for its shape, dtype and device: the displacement (..., n), N
+    (4, ..., n) and what else the field gives, (4, ...). The field is x' and another number at a
+    displacement from x."""
 
     def stage(
         now: tuple[Tensor, Tensor, Tensor], share: tuple[Tensor, Tensor, Tensor, Tensor]
@@ -165,16 +150,12 @@ class StepCount(NamedTuple):
 
 
 def fewest_steps(errors: Callable[[int], Tensor], tolerance: float, most: int) -> StepCount:
-    """Return the fewest steps of fourth order for which all samples are accurate.
+    """Return the fewest steps of fourth order, up to ``most``, for which all samples are accurate, by the
+    errors (P,) of so many steps.
 
     An error that no longer falls with the steps is one of rounding or of a rate with corners: the search
     ends there. Nor do more steps help where most samples are accurate long since and others, which cross a
     jump of the rate, are not.
-
-    Args:
-        errors: of so many steps, by step doubling, (P,).
-        tolerance: of them.
-        most: steps.
     """
     count, served = 1, 0
     last: float | Tensor = math.inf
@@ -209,14 +190,7 @@ class StepsNeeded(NamedTuple):
 def needed_steps(
     errors: Callable[[Tensor, int], Tensor], most: Tensor, tolerance: float, enough: float
 ) -> StepsNeeded:
-    """Return how many times more steps every row needs, by doubling: nothing of another row is looked at.
-
-    Args:
-        errors: of rows (R',) int64 with so many times the steps, (R',).
-        most: times the steps, a row, (R,) int64.
-        tolerance: of the errors.
-        enough: error that is left as it is without more steps.
-    """
+    """Return how many times more steps every row needs, by doubling: nothing of another row is looked at."""
     count, most = len(most), most.cpu()
     factor, error = (
         torch.ones(count, dtype=torch.int64, device="cpu"),

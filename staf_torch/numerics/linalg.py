@@ -73,11 +73,7 @@ def square(call: str, name: str, value: Matrix, size: int) -> Tensor:
 
 
 def positive_definite(call: str, name: str, matrix: Tensor, size: int) -> Tensor:
-    """A symmetric positive definite (size, size) float64 matrix.
-
-    Raises:
-        ValueError: if it is anything else.
-    """
+    """Return a symmetric positive definite (size, size) float64 matrix, anything else refused."""
     values = _eigenvalues(call, name, matrix, size)
     if values is not None and bool(values[0] <= 0):
         raise fail(call, name, "must be positive definite", matrix)
@@ -85,11 +81,8 @@ def positive_definite(call: str, name: str, matrix: Tensor, size: int) -> Tensor
 
 
 def positive_semidefinite(call: str, name: str, matrix: Tensor, size: int) -> Tensor:
-    """A symmetric positive semidefinite (size, size) float64 matrix, to 1e-12 of its largest eigenvalue.
-
-    Raises:
-        ValueError: if it is anything else.
-    """
+    """Return a symmetric positive semidefinite (size, size) float64 matrix, to 1e-12 of its largest
+    eigenvalue; anything else refused."""
     values = _eigenvalues(call, name, matrix, size)
     if values is not None and bool(values[0] < -1e-12 * values.abs().max()):
         raise fail(call, name, "must be positive semidefinite", matrix)
@@ -98,13 +91,8 @@ def positive_semidefinite(call: str, name: str, matrix: Tensor, size: int) -> Te
 
 @designed_on_cpu
 def unstabilisable_mode(a: Tensor, b: Tensor, discrete: bool = False) -> complex | None:
-    """An eigenvalue of A with Re >= 0, or |.| >= 1, that no input reaches (Hautus), None if there is none.
-
-    Args:
-        a: (n, n).
-        b: (n, m).
-        discrete: whether A and B are those of x+ = A x + B u.
-    """
+    """Return an eigenvalue of A (n, n) with Re >= 0, or |.| >= 1 of x+ = A x + B u, that no input of B
+    (n, m) reaches (Hautus); None if there is none."""
     scale = a.abs().max().clamp(min=1.0)
     modes = torch.linalg.eigvals(a)
     stays = modes.abs() >= 1 - 1e-9 if discrete else modes.real >= -1e-9 * scale
@@ -118,18 +106,8 @@ def unstabilisable_mode(a: Tensor, b: Tensor, discrete: bool = False) -> complex
 
 @designed_on_cpu
 def check_modes(a: Tensor, b: Tensor, q: Tensor, *, name: str, discrete: bool = False) -> None:
-    """Refuse a linear plant with a mode that does not decay and that no input reaches or no cost sees.
-
-    Args:
-        a: (n, n), of x' = A x + B u in 1/s, or of x+ = A x + B u.
-        b: (n, m).
-        q: Q, (n, n).
-        name: of the plant, for the message.
-        discrete: whether it is x+.
-
-    Raises:
-        ValueError: if there is one; the message names its eigenvalue.
-    """
+    """Refuse a linear plant x' = A x + B u in 1/s, or x+, with a mode that does not decay and that no
+    input reaches or no cost Q (n, n) sees; the message names the plant and the eigenvalue."""
     unit = "a step" if discrete else "1/s"
     for matrix, other, fault in (
         (a, b, "not stabilisable: no input reaches"),
@@ -145,7 +123,8 @@ def check_modes(a: Tensor, b: Tensor, q: Tensor, *, name: str, discrete: bool = 
 
 
 def solver(name: str) -> Callable[..., Any]:
-    """A function of scipy.linalg, imported where it is needed: half a second that no other import need pay.
+    """Return a function of scipy.linalg, imported where it is needed: half a second that no other import
+    need pay.
 
     Raises:
         ValueError: if SciPy is missing.
@@ -163,17 +142,8 @@ def solver(name: str) -> Callable[..., Any]:
 
 @designed_on_cpu
 def riccati(a: Tensor, b: Tensor, q: Tensor, r: Tensor, *, name: str = "the system") -> Tensor:
-    """P >= 0 with A'P + PA - P B R^-1 B'P + Q = 0: the optimal value x'Px of the linear plant.
-
-    Args:
-        a: A, (n, n), in 1/s.
-        b: B, (n, m).
-        q: Q, (n, n), positive semidefinite.
-        r: R, (m, m), positive definite.
-        name: of the plant, for the message.
-
-    Returns:
-        (n, n), float64, symmetric.
+    """Return P >= 0 with A'P + PA - P B R^-1 B'P + Q = 0, the optimal value x'Px of the linear plant: A (n,
+    n) in 1/s, B (n, m), Q positive semidefinite, R positive definite -> (n, n), float64, symmetric.
 
     Raises:
         ValueError: if Q is not positive semidefinite or R not positive definite, (A, B) is not stabilisable
@@ -191,12 +161,8 @@ def riccati(a: Tensor, b: Tensor, q: Tensor, r: Tensor, *, name: str = "the syst
 
 @designed_on_cpu
 def discrete_riccati(a: Tensor, b: Tensor, paid: Tensor) -> tuple[Tensor, Tensor]:
-    """P and K of x+ = A x + B u that pays z'Wz a step, z = (x, u): the best control -K x, of the value x'Px.
-
-    Args:
-        a: A, (n, n).
-        b: B, (n, m).
-        paid: W, (n + m, n + m).
+    """Return P and K of x+ = A x + B u that pays z'Wz a step, z = (x, u), W (n + m, n + m): the best control
+    -K x, of the value x'Px.
 
     Raises:
         numpy.linalg.LinAlgError, ValueError: of SciPy, if there is none; ValueError if SciPy is missing.

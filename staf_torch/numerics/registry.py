@@ -14,12 +14,8 @@ Kinds = dict[str, Any]
 
 
 def variants(package: str, base: Any) -> Kinds:
-    """Import every file of a package and return the public subclasses of a base, by class name.
-
-    Args:
-        package: its ``__name__``.
-        base: itself among them.
-    """
+    """Import every file of a package, by its ``__name__``, and return the public subclasses of a base,
+    itself among them, by class name."""
     found: Kinds = {}
     for file in pkgutil.iter_modules(sys.modules[package].__path__):
         module = importlib.import_module(f"{package}.{file.name}")

@@ -119,19 +119,13 @@ def _summed(closed: Tensor, added: Tensor) -> Tensor:
 
 
 def _refined(
-    p: Tensor,
-    terms: Callable[[Tensor], _Terms],
-    correction: Callable[[Tensor, Tensor], Tensor],
-    decays: Callable[[Tensor], Tensor],
+    p: Tensor,  # (1, n, n)
+    terms: Callable[[Tensor], _Terms],  # closed loop, residual and its terms, at P
+    correction: Callable[[Tensor, Tensor], Tensor],  # of P, for a closed loop and a residual
+    decays: Callable[[Tensor], Tensor],  # which eigenvalues of the closed loop do
 ) -> Tensor:
-    """P after Newton's steps, each row's own as long as they shrink; NaN where it is no stabilising solution.
-
-    Args:
-        p: (1, n, n).
-        terms: closed loop, residual and its terms, at P.
-        correction: of P, for a closed loop and a residual.
-        decays: which eigenvalues of the closed loop do.
-    """
+    """P after Newton's steps, each row's own as long as they shrink; NaN where it is no stabilising
+    solution."""
     going, before = _Going(), torch.full_like(p[..., :1, :1], torch.inf)
     for _ in range(_NEWTON):
         closed, residual, parts = terms(p)
@@ -200,25 +194,17 @@ class RiccatiStep(NamedTuple):
 
 
 def riccati_step(
-    gradient: Tensor,
-    curvature: Tensor,
-    slope: Tensor,
-    cost_gradient: Tensor,
-    cost_curvature: Tensor,
-    minimum: Minimum,
+    gradient: Tensor,  # g of the model after the step, (B, n)
+    curvature: Tensor,  # H of it, (B, n, n)
+    slope: Tensor,  # F, (B, n, n + m)
+    cost_gradient: Tensor,  # c, (B, n + m)
+    cost_curvature: Tensor,  # W, (B, n + m, n + m)
+    minimum: Minimum,  # chooses k and K
 ) -> RiccatiStep:
     """Riccati step backward through x+ = F z, z = (x, u), with the stage cost c'z + z'Wz/2.
 
     k need not be the minimum: the model is that of the control that is chosen, with all of its terms. All
     products are sums entry by entry, of which a compiled program leaves out what is 0.
-
-    Args:
-        gradient: g of the model after the step, (B, n).
-        curvature: H of it, (B, n, n).
-        slope: F, (B, n, n + m).
-        cost_gradient: c, (B, n + m).
-        cost_curvature: W, (B, n + m, n + m).
-        minimum: chooses k and K.
     """
     n = gradient.shape[-1]
     q1 = cost_gradient + (gradient.unsqueeze(-1) * slope).sum(-2)
@@ -234,15 +220,9 @@ def riccati_step(
 
 
 def measured(covariance: Tensor, gain: Tensor, row: Tensor, variance: Tensor) -> Tensor:
-    """(I - k h') P (I - k h')' + r k k', the covariance after the measurement h'x with the gain k: positive
-    where P - k h'P, which is the same without rounding, may become 0 for ever or negative (Joseph's form).
-
-    Args:
-        covariance: P, (..., n, n).
-        gain: k, (..., n).
-        row: h, (..., n).
-        variance: r, (...).
-    """
+    """(I - k h') P (I - k h')' + r k k', the covariance after the measurement h'x with the gain k:
+    positive where P - k h'P, which is the same without rounding, may become 0 for ever or negative
+    (Joseph's form). P (..., n, n), k and h (..., n), r (...)."""
     seen = (covariance * row.unsqueeze(-2)).sum(-1)
     left = covariance - gain.unsqueeze(-1) * seen.unsqueeze(-2)
     back = (left * row.unsqueeze(-2)).sum(-1)
@@ -263,24 +243,17 @@ class Doubling(NamedTuple):
 
 
 def riccati_rows(a: Tensor, b: Tensor, q: Tensor, r_inverse: Tensor, *, doublings: int = 14) -> Tensor:
-    """Return P >= 0 with A'P + PA - P B R^-1 B'P + Q = 0, every row its own A and B, in so many steps.
+    """Return P >= 0 with A'P + PA - P B R^-1 B'P + Q = 0, every row its own A (..., n, n), 1/s, and B (...,
+    n, m), in so many steps.
 
     Structured doubling on a Cayley transform of the Hamiltonian: k steps leave an error of rho^(2^k), with
     rho < 1 the largest |(l + c) / (l - c)| of the closed loop's eigenvalues l and c twice the norm of A and
     of the rate at which control acts. Where a row cannot be stabilised P is not a solution.
 
-    Args:
-        a: A, (..., n, n), 1/s.
-        b: B, (..., n, m).
-        q: Q, (n, n), positive semidefinite.
-        r_inverse: R^-1, (m, m).
-        doublings: at least 1.
-
     Raises:
         ValueError: if ``doublings`` is not an integer of at least 1.
 
-    Source: Chu, Fan and Lin, "A structure-preserving doubling algorithm for continuous-time algebraic Riccati
-    equations", Linear Algebra Appl. 396 (2005).
+    Source: Chu, Fan and Lin (above).
     """
     integer("riccati_rows", "doublings", doublings, least=1)
     start = doubling_start(a, control_rate(b, r_inverse), q)
@@ -294,13 +267,7 @@ def control_rate(b: Tensor, r_inverse: Tensor) -> Tensor:
 
 
 def doubling_start(a: Tensor, g: Tensor, q: Tensor) -> Doubling:
-    """The pair of the Cayley transform.
-
-    Args:
-        a: A, (..., n, n).
-        g: B R^-1 B', (..., n, n).
-        q: Q, (n, n).
-    """
+    """Return the pair of the Cayley transform, of A and G = B R^-1 B', (..., n, n), and Q (n, n)."""
     size = a.shape[-1]
     q = q.to(a)
     identity = torch.eye(size, dtype=a.dtype, device=a.device)

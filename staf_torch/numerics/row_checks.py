@@ -36,25 +36,16 @@ def is_ours(function: object) -> bool:
 
 
 def check_rows(
-    what: str,
-    function: Callable[..., Any],
-    given: Sequence[Tensor],
-    inner: tuple[int, ...] = (),
+    what: str,  # the argument, in the words of its door: ``SafetyFilter(constraints=...)``
+    function: Callable[..., Any],  # of tensors (R, ...) and then the shared ones, to (R, ...)
+    given: Sequence[Tensor],  # of one row each, (...)
+    inner: tuple[int, ...] = (),  # shape of what it returns for a row
     *,
     shared: Sequence[Tensor] = (),
-    sizes: Collection[int] = (),
+    sizes: Collection[int] = (),  # of the problem, beside those of ``given`` and ``inner``
     rule: str = "`{what}` must map rows {given} to {returned}, whatever their number",
 ) -> None:
     """Refuse a function of rows that does not return floating-point numbers of a shape for every row.
-
-    Args:
-        what: the argument, in the words of its door: ``SafetyFilter(constraints=...)``.
-        function: of tensors (R, ...) and then the shared ones, to (R, ...).
-        given: of one row each, (...).
-        inner: shape of what it returns for a row.
-        shared: as they are.
-        sizes: of the problem, beside those of ``given`` and ``inner``.
-        rule: the beginning of the sentence.
 
     Raises:
         ValueError: that says what it returned, or raised, for how many rows.
@@ -92,13 +83,8 @@ def _of_precision(dtype: torch.dtype) -> str:
 
 
 def once(function: Any, kind: Hashable, check: Callable[[], None]) -> None:
-    """Call a check of a function the first time in a process that it comes with this kind of problem.
-
-    Args:
-        function: of a user; of this library's nothing is checked.
-        kind: what else decides: the check, sizes.
-        check: raises where the function breaks its rule.
-    """
+    """Call a check of a user's function the first time in a process that it comes with this kind of
+    problem: what else decides, as sizes. Of this library's functions nothing is checked."""
     holder, kind = getattr(function, "__self__", function), (getattr(function, "__func__", None), kind)
     try:
         known = _known.setdefault(holder, set())
@@ -113,14 +99,8 @@ def once(function: Any, kind: Hashable, check: Callable[[], None]) -> None:
 def check_target(
     target: Callable[[Tensor], Any], x: Tensor, outputs: int | None = None, *, sizes: Collection[int] = ()
 ) -> None:
-    """Refuse a target V that is not one number a point, or k, whatever the number of points: once a target.
-
-    Args:
-        target: of points (..., n).
-        x: some of them, (..., n), of which one is tried.
-        outputs: k; None for one number.
-        sizes: of the problem.
-    """
+    """Refuse a target V of points (..., n) that is not one number a point, or ``outputs``, whatever the
+    number of points: once a target, at one of the points x."""
 
     def check() -> None:
         if not callable(target):
@@ -137,12 +117,8 @@ def check_target(
 
 
 def check_radius(radius: Callable[[Tensor], Any], directions: Tensor) -> None:
-    """Refuse a radius of a user that is not one number a state, or one for all states, whatever their number.
-
-    Args:
-        radius: nu, of states (..., n).
-        directions: (M, n), of its centers.
-    """
+    """Refuse a radius nu of a user that is not one number a state, or one for all states, whatever their
+    number; its centers have directions (M, n)."""
     if is_ours(type(radius)) or directions.is_meta:
         return
 
@@ -162,12 +138,8 @@ def check_radius(radius: Callable[[Tensor], Any], directions: Tensor) -> None:
 
 
 def check_kernel(kernel: Any, directions: Tensor) -> None:
-    """Refuse a kernel of a user, or a closed form of it, that does not return its shape in every row.
-
-    Args:
-        kernel: k, with the methods of `kernels.Kernel`.
-        directions: (M, n), of its centers.
-    """
+    """Refuse a kernel of a user, or a closed form of it, that does not return its shape in every row; its
+    centers have directions (M, n)."""
     if is_ours(type(kernel)) or directions.is_meta:
         return
 
@@ -190,13 +162,8 @@ def check_kernel(kernel: Any, directions: Tensor) -> None:
 
 
 def check_law(law: Any, objective: Callable[[Tensor, Tensor], Any], row: Tensor) -> None:
-    """Refuse a law of a user that does not return weights and a state of every row.
-
-    Args:
-        law: with the methods of `optim.UpdateLaw`.
-        objective: makes one of Gram matrices (R, M, M) and values (R, M).
-        row: zeros (M,).
-    """
+    """Refuse a law of a user that does not return weights and a state of every row (M,); ``objective``
+    makes one of Gram matrices (R, M, M) and values (R, M)."""
     if is_ours(type(law)):
         return
     count, name = len(row), type(law).__name__
@@ -222,13 +189,10 @@ def check_law(law: Any, objective: Callable[[Tensor, Tensor], Any], row: Tensor)
 
 
 def check_metric(metric: Callable[[Any, Any], Any], result: Any, problem: Any) -> None:
-    """Refuse a metric of a user that does not return one number a time of every row, where the number of rows
-    is also another size of the result, and its shape alone says nothing.
+    """Refuse a metric of a user that does not return one number a time of every row, (B, T), where the
+    number of rows is also another size of the result, and its shape alone says nothing.
 
-    Args:
-        metric: of a result and its problem, to (B, T).
-        result: a dataclass of tensors (B, ...), ``time`` (T,), and dictionaries of such.
-        problem: as it is.
+    The result is a dataclass of tensors (B, ...), ``time`` (T,), and dictionaries of such.
     """
     batch, times = result.state.shape[:2]
     parts = {f.name: getattr(result, f.name) for f in dataclasses.fields(result) if f.name != "time"}

@@ -21,13 +21,8 @@ def chosen(rows: Tensor, new: Some, old: Some) -> Some:
 
 
 def known_quantile(values: Tensor, share: float, *, lower: bool = False) -> Tensor:
-    """Return the quantile of the values that are not NaN, (P,) -> (); NaN where there are none.
-
-    Args:
-        values: at least one.
-        share: in [0, 1].
-        lower: whether to return the value below, else both neighbours are interpolated linearly.
-    """
+    """Return the quantile of the values that are not NaN, (P,) -> (); NaN where there are none. With
+    ``lower`` it is the value below, else both neighbours are interpolated linearly."""
     ordered = values.sort().values  # NaN last
     last = (values == values).sum() - 1
     place = (share * last.clamp(min=0).to(values)).unsqueeze(0)

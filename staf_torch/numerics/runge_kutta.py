@@ -48,14 +48,8 @@ def runge_kutta_stages(
     dt: float | Tensor,
     displaced: Callable[[Tensor, Tensor], Tensor] = operator.add,
 ) -> tuple[list[Tensor], list[Tensor]]:
-    """The four states at which a step asks the field, and its answers there.
-
-    Args:
-        field: x' from x and the share of the step that has passed, one of `SHARES`.
-        x: (..., n).
-        dt: as in `runge_kutta_step`.
-        displaced: likewise.
-    """
+    """The four states at which a step from x (..., n) asks the field, and its answers there: x' from x
+    and the share of the step that has passed, one of `SHARES`."""
     states, slopes = [x], [field(x, SHARES[0])]
     for share in SHARES[1:]:
         states.append(displaced(x, share * dt * slopes[-1]))
@@ -112,16 +106,9 @@ def runge_kutta_loop(
 ) -> tuple[Tensor, ...]:
     """`runge_kutta_step` with what is paid, as a loop over the stages, of which a program then contains one.
 
-    Args:
-        displaced: the state that a step leads to, as `systems.Plant.displaced`.
-        field: the velocity and the cost rate at a state.
-        x: (..., n).
-        length: s, a number or one a row.
-        discount: 1/s, of what is paid.
-        watch: whether to return how much the field bends within the step, h |k_3 - k_2|, the largest, too.
-
-    Returns:
-        x+ (..., n) and what was paid, (...).
+    Returns x+ (..., n) and what was paid, (...), discounted by ``discount``, 1/s; with ``watch`` also how
+    much the field bends within the step, h |k_3 - k_2|, the largest. The field is the velocity and the cost
+    rate at a state, the length in s a number or one a row, ``displaced`` as `systems.Plant.displaced`.
     """
 
     def stage(now: RungeKuttaSums, share: tuple[Tensor, Tensor, Tensor]) -> tuple[RungeKuttaSums, Any]:

@@ -102,13 +102,9 @@ _packed = struct.Struct("7q").pack  # `Given` of _filter.cpp: what belongs to a 
 
 
 class CompiledFilter:
-    """`LocalFilter.predict` and `learn` of one `StreamState`, a stream in every vector lane.
-
-    Args:
-        definition: the filter; a kernel with a constant diagonal and exponent rate, on the processor.
-        state: of the streams. Its tensors must not be replaced while this is in use.
-        call: the compiled function.
-    """
+    """`LocalFilter.predict` and `learn` of one `StreamState`, whose tensors must not be replaced
+    meanwhile, a stream in every vector lane; of a kernel with a constant diagonal and exponent rate, on
+    the processor."""
 
     def __init__(self, definition: LocalFilter, state: StreamState, call: Callable[..., None]) -> None:
         ratio, forgetting = definition.ratio.contiguous(), definition.forgetting.contiguous()
@@ -176,15 +172,11 @@ class CompiledFilter:
 
 
 class DirectCalls:
-    """Calls of a compiled filter on a few streams that need no lock: they hold Python's own.
+    """Calls of a compiled filter on a few streams, `short`, that need no lock: they hold Python's own.
+    Samples of this dtype and these shapes are read where they lie.
 
-    What a call must fit and where the streams lie is one object, so that both are always of the same streams.
-
-    Args:
-        filter_: the compiled filter, whose calls are `short`.
-        dtype: of samples that are read where they lie.
-        shape: of their x.
-        targets: of their y.
+    What a call must fit and where the streams lie is one object, so that both are always of the same
+    streams.
     """
 
     def __init__(

@@ -245,11 +245,8 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         self.n_outputs_ = outputs if y.dim() == x.dim() else None
 
     def _placed(self, call: str, name: str, value: Tensor) -> Tensor:
-        """Return a sample in the dtype of the streams.
-
-        Raises:
-            ValueError: if it is on another device than the first sample, and the streams take none there.
-        """
+        """Return a sample in the dtype of the streams, refused on another device than the first sample
+        where the streams take none there."""
         if value.device != self._device_ and (value.is_meta or not self._streams_.moves):
             rule = f"must be on {self._device_}, where the first sample was"
             raise ValueError(f"`{self._call(call)}({name}=...)` {rule}; got one on {value.device}.")

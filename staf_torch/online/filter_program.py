@@ -31,14 +31,11 @@ def step(carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
 
 
 def after(functions: LocalFunctions | OwnFunctions, carry: Tree, now: Tree, law: Tree) -> tuple[Tree, Tree]:
-    """The state after a sample of every stream, and mean and deviation (S, K) expected before.
+    """Return the state after a sample x (S, n), y (S, K), lapse (S,) of every stream, and mean and deviation
+    (S, K) expected before.
 
-    Args:
-        functions: the local functions.
-        carry: the table (S, rows) in the dtype of the streams, in three parts of which the second is D's
-            lower triangle; counts (S, 4).
-        now: x (S, n), y (S, K) and lapse (S,).
-        law: as `law_of`.
+    The carry is the table (S, rows) in the dtype of the streams, in three parts of which the second is D's
+    lower triangle, and counts (S, 4); the law is that of `law_of`.
     """
     (*parts, counts), (x, y, lapse) = carry, now
     filter_, real, old = LocalFilter(functions, *law), parts[0].dtype, _state(parts)
@@ -110,12 +107,8 @@ def carry_of(state: StreamState) -> tuple[Tensor, ...]:
 
 
 class KernelFilter:
-    """`LocalFilter.predict` and `learn` as kernels of a device, a stream a thread.
-
-    Args:
-        definition: the filter; a kernel with a constant diagonal and exponent rate.
-        state: of the streams.
-    """
+    """`LocalFilter.predict` and `learn` as kernels of a device, a stream a thread; of a kernel with a
+    constant diagonal and exponent rate."""
 
     def __init__(self, definition: LocalFilter, state: StreamState) -> None:
         functions, where = definition.functions, state.blocks.device
@@ -173,15 +166,10 @@ def log_density(y: Tensor, mean: Tensor, deviation: Tensor) -> Tensor:
 
 
 def forecasts(filter_: LocalFilter, x: Tensor, y: Tensor, lapse: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation of every sample, from those before it: (S, T, K) each.
+    """Return mean and standard deviation (S, T, K) of every sample from those before it, of S streams that
+    have learned nothing: x (S, T, n), float64, y (S, T, K), lapse (S, T).
 
     With `OwnFunctions` compiled, forwards and backwards; with others in plain torch.
-
-    Args:
-        filter_: of S streams that have learned nothing.
-        x: (S, T, n), float64.
-        y: (S, T, K).
-        lapse: (S, T).
     """
     rows, functions = len(x), filter_.functions
     numbers = tuple(torch.as_tensor(part, device=x.device).double().expand(rows) for part in law_of(filter_))

@@ -252,13 +252,8 @@ class FilterStreams:
                 self._relearn(rows, samples, added=1)
 
     def _relearn(self, rows: Tensor, samples: Tensor, added: int = 0) -> None:
-        """Let streams forget all but these samples and their lapses, (R, N, n + K + 1), in their units.
-
-        Args:
-            rows: numbers of the streams, (R,).
-            samples: oldest first.
-            added: 1 where the latest of them has not been counted yet.
-        """
+        """Let streams (R,) forget all but these samples and their lapses, (R, N, n + K + 1), oldest
+        first, in their units; ``added`` is 1 where the latest of them has not been counted yet."""
         wide, n = self.state.dim + self.state.outputs, self.state.dim
         self._center, self._spread = self.units.to(self.dtype).split(wide, dim=1)
         center, spread = self.units[rows].unsqueeze(1).split(wide, dim=-1)
@@ -294,11 +289,7 @@ class FilterStreams:
         self._calm = False
 
     def add(self, streams: int) -> None:
-        """Begin further streams, behind the others.
-
-        Raises:
-            ValueError: if the streams have numbers of their own.
-        """
+        """Begin further streams, behind the others; refused where the streams have numbers of their own."""
         if isinstance(self.definition.functions, OwnFunctions):
             raise ValueError("streams with numbers of `rows(...)` are as many as these: none can be added.")
         fresh = StreamState.empty(self.state.blocks, streams, *self.state.sizes)
@@ -335,12 +326,8 @@ class FilterStreams:
         return {"table": self.state.table, "counts": self.state.counts} | own | law
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over what `state_dict` of as many streams has.
-
-        Raises:
-            ValueError: if a tensor has another shape, dtype or device, since compiled code goes by these, or
-                if kernel or centers are others.
-        """
+        """Take over what `state_dict` of as many streams has; refused where a tensor has another shape,
+        dtype or device, since compiled code goes by these, or kernel or centers are others."""
         given_table = table_of(state)
         refuse_other(state, self._learned(), self.state.blocks.shape[1], given_table.shape[0])
         for name, own in self._fixed().items():
@@ -375,14 +362,8 @@ def table_of(state: dict[str, Any]) -> Tensor:
 
 
 def refuse_other(state: dict[str, Any], own: dict[str, Tensor], expected: int, given: int) -> None:
-    """Raise where a saved state has other tensors than a new one.
-
-    Args:
-        state: that was saved.
-        own: tensors of the new one, by name.
-        expected: numbers a stream of the new one.
-        given: numbers a stream of the saved table.
-    """
+    """Refuse a saved state with other tensors than a new one's ``own``, by name, or other numbers a
+    stream."""
     name = "`load_state_dict(state=...)`"
     if given != expected:
         told = f"must have {expected} numbers a stream, as this version and these arguments have; got {given}"

@@ -127,15 +127,8 @@ class LocalFilter:
         return _Outlook(mean, far * whole.sqrt(), weight, unknown)
 
     def learn(self, state: StreamState, x: Tensor, y: Tensor, lapse: Tensor | None = None) -> None:
-        """Learn one sample a stream, in place, computed in float64.
-
-        Args:
-            state: of the streams.
-            x: (S, n).
-            y: (S, K).
-            lapse: time since the sample before, (S,), ones by default: what was learned fades by
-            lambda^lapse.
-        """
+        """Learn one sample a stream, x (S, n), y (S, K), in place, computed in float64; ``lapse`` (S,) is
+        the time since the sample before, by default 1: what was learned fades by lambda^lapse."""
         lapse = torch.ones_like(self.ratio) if lapse is None else lapse
         counts = Counts(*state.counts.unbind())
         parts, counts = self.learned(
@@ -147,16 +140,8 @@ class LocalFilter:
     def learned(
         self, old: StateParts, counts: Counts, x: Tensor, y: Tensor, lapse: Tensor, numbers: torch.finfo
     ) -> tuple[StateParts, Counts]:
-        """Return the state after one sample a stream.
-
-        Args:
-            old: the state before.
-            counts: samples before.
-            x: (n, S).
-            y: (K, S).
-            lapse: (S,).
-            numbers: limits of the table's dtype.
-        """
+        """Return the state after one sample a stream, x (n, S), y (K, S), lapse (S,); ``numbers`` are the
+        limits of the table's dtype."""
         samples, skipped, streak, since = counts
         measured = ~torch.isnan(x).all(0)
         x = torch.where(torch.isnan(x), old.last, x.double())
@@ -267,21 +252,12 @@ class LocalFilter:
 def spread_with(
     y: Tensor, level: Tensor, spread: Tensor, size: Tensor, leaps: Tensor, told: Tensor, age: Tensor
 ) -> tuple[Tensor, ...]:
-    """The running mean and deviation of y with another value.
+    """Return the running mean and deviation of y with another value: the next level, spread, leaps and told.
 
     The first values may be outliers, and fade sooner. As long as y is constant it counts as one value.
-
-    Args:
-        y: the value.
-        level: mean so far.
-        spread: deviation so far, 0 at first.
-        size: that deviation, or another one where y has been constant.
-        leaps: values in a row that were far away.
-        told: values so far.
-        age: samples so far; of some, a first other value may be an outlier.
-
-    Returns:
-        The next level, spread, leaps and told.
+    ``size`` is that deviation, or another one where y has been constant, ``leaps`` counts values in a row
+    that were far away, ``told`` values so far, ``age`` samples so far: of some, a first other value may be
+    an outlier.
     """
     rate = torch.minimum(3 / (told + 3), 1 / (told - 40).clamp(min=1.0)).clamp(min=SPREAD_RATE)
     step, leaps = _limited((y - level).abs(), size, leaps, torch.where(told > 0, age, 0.0))
@@ -323,15 +299,8 @@ def smooth_record(
     P' = I - lambda T D T'. Backwards u_k <- u_k + G (u_k+1 - u'_k+1) with the gain G = P_k T' P'_k+1^-1, and
     the covariances alike.
 
-    Args:
-        filter_: the definition.
-        state: of the streams at the beginning, updated to the end.
-        x: (T, S, n).
-        y: (T, S, K).
-        lapse: (T, S).
-
-    Returns:
-        Mean (T, S, K) and standard deviation (T, S, 1) of V, without noise, in the units of y.
+    Returns the mean (T, S, K) and standard deviation (T, S, 1) of V, without noise, in the units of y, for x
+    (T, S, n), y (T, S, K), lapse (T, S); ``state``, that at the beginning, is updated to the end.
     """
     eye = torch.eye(state.count, dtype=torch.float64, device=x.device)
     means, covariances, expected, predicted, transfers, anchors = [], [], [], [], [], []

@@ -118,19 +118,13 @@ class LocalFunctions(NamedTuple):
         return None if scale is None else scale.squeeze(-1)
 
     def transfer(self, x: Tensor, step: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Return the map u' = e^f T u of the weights as x moves by h; T alone maps what was learned.
+        """Return the map u' = e^f T u of the weights as x moves by h, (n, R) each; T alone maps what was
+        learned.
 
-        T = C'(x + h) diag(m) k0(h + d, d) C(x) with m_i = e^{s(x, h + d_i) - s(x + h, d_i) - f}, and
-        f = (g(x + h) - g(x))/2: the local function at the new centers, fitted there. T is the compression of
-        a unitary translation, so that |T| <= 1. For k0 = exp(q z'd) the spans at two states differ by the
-        factor e^{-q h'z} alone, which m carries.
-
-        Args:
-            x: (n, R).
-            step: h, (n, R).
-
-        Returns:
-            T (M, M, R), and e^f, (R,), None for ones.
+        T = C'(x + h) diag(m) k0(h + d, d) C(x) with m_i = e^{s(x, h + d_i) - s(x + h, d_i) - f}, and f =
+        (g(x + h) - g(x))/2: the local function at the new centers, fitted there. T is the compression of a
+        unitary translation, so that |T| <= 1. For k0 = exp(q z'd) the spans at two states differ by the
+        factor e^{-q h'z} alone, which m carries. T is (M, M, R); e^f is (R,), None for ones.
         """
         d = self.offsets
         reach = d.square().sum(-1).amax().clamp(min=1e-300).sqrt()
@@ -241,15 +235,7 @@ def has_rows(numbers: dict[str, Any], kernel: Kernel) -> bool:
 def own_law(
     call: str, numbers: dict[str, Any], dtype: torch.dtype, streams: int, like: Tensor
 ) -> dict[str, Tensor]:
-    """Return the checked arguments, (S,) each.
-
-    Args:
-        call: in whose name an error speaks.
-        numbers: of `NAMES`.
-        dtype: of the streams.
-        streams: S.
-        like: a tensor where they are to be.
-    """
+    """Return the checked arguments of `NAMES`, (S,) each, where the tensor ``like`` is."""
 
     def column(name: str, value: Any) -> Tensor:
         sign = "not negative" if name == "follow" else "positive"

@@ -14,14 +14,8 @@ from ..numerics.checks import fail, fails
 
 
 def tensor_of(call: str, name: str, value: Any, *, recorded: bool = False) -> Tensor:
-    """A tensor as it is; arrays and numbers as tensors; integers as float64.
-
-    Args:
-        call: in whose name an error speaks.
-        name: of the argument.
-        value: that was given.
-        recorded: whether a tensor that requires a gradient is taken with it, and not refused.
-    """
+    """Return a tensor as it is, arrays and numbers as tensors, integers as float64; where it is
+    ``recorded`` a tensor that requires a gradient is taken with it, and not refused."""
     if isinstance(value, Tensor):
         if value.requires_grad and not recorded:
             refuse_gradient(call, **{name: value})
@@ -115,11 +109,8 @@ def lapses(call: str, time: Any, states: Tensor) -> Tensor | None:
 
 
 def lapse_of(call: str, lapse: Any, streams: int) -> Tensor:
-    """Time since the sample before, (S,) float64.
-
-    Raises:
-        ValueError: unless it is one number, or one for each stream, finite and not negative.
-    """
+    """Return the time since the sample before, (S,) float64, refused unless it is one number, or one for
+    each stream, finite and not negative."""
     given = tensor_of(call, "lapse", lapse).double()
     fits = given.dim() <= 1 and given.numel() in (1, streams)
     if not fits or fails((given >= 0) & (given < torch.inf)):

@@ -27,11 +27,8 @@ class ScikitEstimator:
         return found
 
     def set_params(self, **params: Any) -> Any:
-        """Set arguments of the constructor; they hold from the next `reset` or `fit` on.
-
-        Raises:
-            ValueError: for a name that is none.
-        """
+        """Set arguments of the constructor, a name that is none refused; they hold from the next `reset`
+        or `fit` on."""
         for name, value in params.items():
             own, _, nested = name.partition("__")
             choice(f"{type(self).__name__}.set_params", "params", own, parameters(type(self)))

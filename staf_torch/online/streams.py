@@ -42,15 +42,11 @@ class Streams(Protocol):
 
 
 class TurningStreams:
-    """Streams whose periodic coordinates of x are turned by whole turns to within pi of the latest ones.
+    """Streams whose periodic coordinates of x, in rad, are turned by whole turns to within pi of the latest
+    x (S, n), NaN where there is none.
 
-    The centers of a filter follow the latest x, so that nothing is lost by not going back: what was learned a
-    turn before was forgotten when the centers left it.
-
-    Args:
-        inner: the streams.
-        periodic: coordinates of x that are angles in rad.
-        latest: x (S, n) learned last, NaN where there is none.
+    The centers of a filter follow the latest x, so that nothing is lost by not going back: what was learned
+    a turn before was forgotten when the centers left it.
     """
 
     def __init__(self, inner: Streams, periodic: Sequence[int], latest: Tensor) -> None:

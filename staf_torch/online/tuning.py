@@ -137,14 +137,8 @@ Scores = Callable[[_Candidates], Tensor]  # likelihoods (S, C) of the later two 
 
 @designed_on_cpu
 def tuning(x: Tensor, y: Tensor, directions: Tensor, method: str = "search") -> Tuning:
-    """Widths a coordinate, noise, forgetting and radius a stream by the one-step predictive likelihood.
-
-    Args:
-        x: (T, S, n), a stretch of every stream.
-        y: (T, S, K).
-        directions: of the centers, (M, n).
-        method: ``search`` or ``gradient``.
-    """
+    """Return widths a coordinate, noise, forgetting and radius a stream by the one-step predictive
+    likelihood of a stretch x (T, S, n), y (T, S, K), with centers of these directions (M, n)."""
     both = torch.cat((x, y), -1).double()
     seen = torch.isfinite(both)
     learned = units_of(torch.where(seen, both, torch.nan).flatten(1))
@@ -244,13 +238,8 @@ def _scores(candidates: _Candidates, samples: Tensor, n: int, offsets: Tensor) -
 
 
 class _StretchScores:
-    """`_scores` by the program that runs the filter over a stretch, with gradients by the candidates.
-
-    Args:
-        samples: (T, S, n + K).
-        n: coordinates of x.
-        offsets: of the centers, (M, n).
-    """
+    """`_scores` by the program that runs the filter over a stretch of samples (T, S, n + K), with
+    gradients by the candidates; centers of offsets (M, n)."""
 
     def __init__(self, samples: Tensor, n: int, offsets: Tensor) -> None:
         self._x, self._y = samples[:, :, None, :n], samples[:, :, None, n:]
@@ -361,17 +350,13 @@ def _without(best: _Candidates, left_out: Tensor) -> _Candidates:
 
 
 def _widened(width: Tensor, spread: Tensor, extent: Tensor, unknown: Tensor) -> tuple[Tensor, ...]:
-    """Widths in the units of x, and in standard deviations: of the others where a coordinate hardly moves.
+    """Return widths in the units of x, and in standard deviations: of the others where a coordinate hardly
+    moves.
 
-    Args:
-        width: that were found, (S, n), in standard deviations of x.
-        spread: these standard deviations, (S, n), 1 for a constant.
-        extent: from the least x to the largest, (S, n).
-        unknown: as `_unknown` says, (S, n).
-
-    Returns:
-        The first, (S, n); the second, (S, n), of the others wherever nothing is known; and which of the
-        first are the geometric mean of the known ones now, (S, n).
+    From widths in standard deviations of x, these deviations, 1 for a constant, the extent from the least x
+    to the largest, and what `_unknown` says, (S, n) each. The second are those of the others wherever
+    nothing is known; the third, (S, n), says which of the first are the geometric mean of the known ones
+    now.
     """
 
     def others(values: Tensor) -> Tensor:
@@ -387,13 +372,8 @@ def _widened(width: Tensor, spread: Tensor, extent: Tensor, unknown: Tensor) -> 
 
 
 def _warn(covered: Tensor, width: Tensor, wider: Tensor) -> None:
-    """Log a line if a coordinate covers little of a width: what comes later may be beyond.
-
-    Args:
-        covered: in widths, (S, n).
-        width: (S, n).
-        wider: where the width is that of the other coordinates, (S, n).
-    """
+    """Log a line if a coordinate covers little of a width: what comes later may be beyond. ``covered`` is
+    in widths, ``wider`` where the width is that of the other coordinates, (S, n) each."""
     n = covered.shape[1]
     most = SHORT / math.sqrt(n)
     if bool((covered < most).any()):

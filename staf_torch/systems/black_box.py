@@ -83,17 +83,9 @@ class BlackBox:
     def follow(
         self, x: Numbers, feedback: Callable[[Numbers], Numbers], steps: int
     ) -> tuple[Numbers, Numbers]:
-        """Every state and control under a feedback, of a function in NumPy that is a step: by the function's
-        own ``follow_feedback``, where it has one that does not return None, else a call a step.
-
-        Args:
-            x: (B, n).
-            feedback: (B, n) -> (B, m).
-            steps: T.
-
-        Returns:
-            (B, T + 1, n), (B, T, m).
-        """
+        """Return every state (B, T + 1, n) and control (B, T, m) from x (B, n) under a feedback (B, n) ->
+        (B, m), of a function in NumPy that is a step: by the function's own ``follow_feedback``, where it
+        has one that does not return None, else a call a step."""
         whole = getattr(self._function, "follow_feedback", None)
         found: tuple[Numbers, Numbers] | None = whole(x, feedback, steps) if callable(whole) else None
         if found is not None:
@@ -105,12 +97,8 @@ class BlackBox:
         return np.stack(states, axis=1), np.stack(controls, axis=1)
 
     def linearisation(self, x: Tensor, u: Tensor, apart: Apart = operator.sub) -> Linearisation:
-        """d/dx and d/du at one point (n,), (m,).
-
-        Args:
-            x: (n,).
-            u: (m,).
-            apart: the difference of two values, of a step with angles as `Plant.difference`.
+        """d/dx and d/du at one point (n,), (m,); ``apart`` is the difference of two values, of a step with
+        angles as `Plant.difference`.
 
         Raises:
             ValueError: if the function has a kink there: slopes of two step sizes differ by more than 5 %; or

@@ -21,17 +21,8 @@ _STEPS = 50
 
 
 def check_rest(plant: Plant, x: Tensor, u: Tensor) -> None:
-    """Refuse a state and an input at which the plant moves.
-
-    Args:
-        plant: the plant.
-        x: (n,).
-        u: (m,).
-
-    Raises:
-        ValueError: if the motion exceeds 1e-6 of the plant's rates there, with its value and the nearest
-            equilibrium.
-    """
+    """Refuse a state (n,) and an input (m,) at which the plant moves, by more than 1e-6 of its rates
+    there, with its value and the nearest equilibrium."""
     if _rests(plant, x, u):
         return
     moves = _motion(plant, x, u)
@@ -63,13 +54,8 @@ def _nearest(plant: Plant, x: Tensor, u: Tensor) -> str:
 
 
 def resting_input_at(plant: Plant, x: Tensor, guess: Tensor | None = None) -> Tensor:
-    """The input that comes nearest to holding the plant at x (n,), by Gauss-Newton steps: (m,).
-
-    Args:
-        plant: the plant.
-        x: (n,).
-        guess: (m,); by default the resting input of the plant.
-    """
+    """Return the input (m,) that comes nearest to holding the plant at x (n,), by Gauss-Newton steps from
+    a guess, by default the plant's resting input."""
     u = plant.resting_input() if guess is None else guess
     return _gauss_newton(lambda v: _motions(plant, x.expand(len(v), -1), v), u)
 

@@ -167,11 +167,7 @@ def _key(key: Any) -> Any:
 
 
 class InTorch:
-    """A function of arrays x (B, n) and u (B, m), of tensors.
-
-    Args:
-        function: written in NumPy.
-    """
+    """A function of arrays x (B, n) and u (B, m), written in NumPy, of tensors."""
 
     def __init__(self, function: Function) -> None:
         self.function = function

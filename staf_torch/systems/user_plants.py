@@ -60,15 +60,9 @@ class FunctionPlant(Plant):
         return self.function.torch
 
     def in_torch(self, x: Tensor, u: Tensor) -> Self | None:
-        """Return the plant with a function that torch follows through NumPy, or itself if it is torch.
-
-        Args:
-            x: states at which the two must agree to rounding, (B, n).
-            u: inputs likewise, (B, m).
-
-        Returns:
-            None of a plant that is more than its function, and where torch cannot follow or disagrees.
-        """
+        """Return the plant with a function that torch follows through NumPy, or itself if it is torch;
+        both agree to rounding at states (B, n) and inputs (B, m). None of a plant that is more than its
+        function, and where torch cannot follow or disagrees."""
         if self.traceable:
             return self
         box = self.function.in_torch(x, u) if type(self) in (StepPlant, RatePlant) else None

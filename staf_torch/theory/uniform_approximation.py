@@ -23,23 +23,13 @@ _FLOOR = 1e-9  # of the mean weight: no point is ever dropped for good
 
 
 def ball_grid(dim: int, shells: int, directions: int) -> Tensor:
-    """The origin and ``shells`` spheres of the closed unit ball, crowded towards its surface.
+    """The origin and ``shells`` spheres of the closed unit ball, crowded towards its surface: (1 + shells
+    directions, dim), float64, the origin first.
 
-    The radii are cos(pi k / (2 shells)), so that with the origin each diameter carries Chebyshev-like
-    nodes. In the plane every circle has ``directions`` equally spaced angles, every other circle turned
-    by half a step; on a line there are two directions; in space the directions of all shells together
-    are a low-discrepancy sequence.
-
-    Args:
-        dim: n, at least 1.
-        shells: at least 1.
-        directions: of each shell, at least 1.
-
-    Returns:
-        (1 + shells directions, dim), float64, the origin first.
-
-    Raises:
-        ValueError: if an argument is not a positive integer.
+    The radii are cos(pi k / (2 shells)), so that with the origin each diameter carries Chebyshev-like nodes.
+    In the plane every circle has ``directions`` equally spaced angles, every other circle turned by half a
+    step; on a line there are two directions; in space the directions of all shells together are a
+    low-discrepancy sequence.
     """
     for name, value in (("dim", dim), ("shells", shells), ("directions", directions)):
         integer("ball_grid", name, value, least=1)
@@ -63,18 +53,12 @@ def _directions(dim: int, shells: int, directions: int) -> Tensor:
 
 
 def supremum(function: Callable[[Tensor], Tensor], grid: Tensor, radius: float) -> Tensor:
-    """max f_j(z) over |z| <= radius for each of D functions: the largest values on a grid, then uphill.
+    """max f_j(z) over |z| <= radius for each of D functions: the largest values on a grid of the ball (P,
+    n), then uphill; (D,), NaN where a value on the grid is.
 
     From the points of the grid with the largest values a pattern search climbs on, in steps along the axes
-    that are halved where none of them gains; points that leave the ball go back to its surface.
-
-    Args:
-        function: f, offsets (P, n), the same for all, or (D, P, n), to values (D, P).
-        grid: of the ball, (P, n).
-        radius: of the ball.
-
-    Returns:
-        (D,), NaN where a value on the grid is.
+    that are halved where none of them gains; points that leave the ball go back to its surface. f maps
+    offsets (P, n), the same for all, or (D, P, n), to values (D, P).
     """
     values = function(grid)
     best, where = values.topk(min(_STARTS, len(grid)))  # NaN counts as the largest
@@ -135,25 +119,17 @@ class NearBest(NamedTuple):
 
 @Sign("near_best")
 def near_best(points: Tensor, degree: int, values: Tensor, weight: Tensor, tolerance: Tensor) -> NearBest:
-    """Minimise max_j weight_j |f(z_j) - p(z_j)| over the polynomials p of the degree, row by row.
+    """Return the best polynomials p of the degree that were met in minimising max_j weight_j |f(z_j) -
+    p(z_j)|, row by row: z (P, n) well inside what is numerically fine for monomials, the unit ball, f and
+    weights (D, P), the error to reach (D,).
 
-    Lawson's iteration: weighted least squares whose weights are multiplied by the errors they left.
-    The error of every weighted fit bounds the best uniform error from below, so a row that cannot meet
-    its tolerance is known early; the iteration then stops for all, as the degree is of no use. A row that
-    is well within its tolerance is left as it is.
+    Lawson's iteration: weighted least squares whose weights are multiplied by the errors they left. The
+    error of every weighted fit bounds the best uniform error from below, so a row that cannot meet its
+    tolerance is known early; the iteration then stops for all, as the degree is of no use. A row that is
+    well within its tolerance is left as it is.
 
-    Args:
-        points: z, (P, n), well inside what is numerically fine for monomials: the unit ball.
-        degree: of the polynomials.
-        values: f(z_j), (D, P).
-        weight: positive, (D, P).
-        tolerance: the error to reach, (D,).
-
-    Returns:
-        The best polynomials that were met.
-
-    Source: Lawson, "Contributions to the theory of linear least maximum approximation", UCLA (1961);
-    Rice and Usow, "The Lawson algorithm and extensions", Math. Comp. 22 (1968).
+    Source: Lawson, "Contributions to the theory of linear least maximum approximation", UCLA (1961); Rice
+    and Usow, "The Lawson algorithm and extensions", Math. Comp. 22 (1968).
     """
     orthonormal, triangle = torch.linalg.qr(monomials(points, degree))
     rows = max(1, _BLOCK // orthonormal.numel())

@@ -25,16 +25,7 @@ _RESIDUAL = 1e-2  # residual of the Riccati equation, for the model of the momen
 
 
 class Redesign:
-    """Riccati equations of rows, solved anew at every control of a loop.
-
-    Args:
-        call: whose arguments these are, for messages.
-        cost: the cost rate, without discount.
-        doublings: of a design, at least 1.
-
-    Raises:
-        ValueError: if an argument breaks its rule.
-    """
+    """Riccati equations of rows, solved anew at every control of a loop, for a cost without discount."""
 
     def __init__(self, call: str, cost: Cost, doublings: int) -> None:
         if cost.discount:

@@ -214,14 +214,8 @@ class ConcurrentGradient(metaclass=OfRows):
         theta+ = (I + h Gam gain sum_j S_j'S_j)^-1 (theta + h Gam (push + gain sum_j S_j'z_j)).
 
     It converges without persistent excitation once sum_j S_j'S_j has full rank. ``push`` is what the control
-    adds, Y'e of an adaptive tracking law for one.
-
-    Args:
-        gain: k_CL, positive, a number or one a row, (...).
-        rate: Gam, positive, likewise: a multiple of the identity.
-
-    Raises:
-        ValueError: if a number is not positive.
+    adds, Y'e of an adaptive tracking law for one. k_CL and Gam, a multiple of the identity, are positive
+    numbers, or one a row, (...).
     """
 
     def __init__(self, gain: float | Tensor = 1.0, rate: float | Tensor = 1.0) -> None:
@@ -233,15 +227,8 @@ class ConcurrentGradient(metaclass=OfRows):
     def step(
         self, theta: Tensor, gram: Tensor, moment: Tensor, dt: float, push: Tensor | None = None
     ) -> Tensor:
-        """theta after ``dt`` seconds: (..., p).
-
-        Args:
-            theta: (..., p).
-            gram: sum of S'S over the stack, (..., p, p).
-            moment: sum of S'z, (..., p).
-            dt: s.
-            push: (..., p).
-        """
+        """Return theta (..., p) after ``dt`` seconds, with the sums of S'S (..., p, p) and S'z (..., p)
+        over the stack."""
         lead = gram.new_zeros(gram.shape[:-2])
         rate, gain = dt * (lead + self.rate).unsqueeze(-1), (lead + self.gain).unsqueeze(-1)
         identity = torch.eye(theta.shape[-1], dtype=theta.dtype, device=theta.device)

@@ -60,12 +60,8 @@ class Windows(metaclass=OfRows):
     length: float  # s, of the longest
 
     def init(self, x: Tensor, length: Tensor | None = None) -> Window:
-        """Return an empty window, a row each of the states (..., n).
-
-        Args:
-            x: for the shape alone.
-            length: (...), of every row; the common one by default.
-        """
+        """Return an empty window, a row each of the states (..., n), of the length (...) of every row or
+        the common one."""
         lead, count = x.shape[:-1], len(self.model.rows)
         return Window(
             torch.zeros_like(x),
@@ -81,13 +77,8 @@ class Windows(metaclass=OfRows):
 
     @abc.abstractmethod
     def step(self, state: Window, x: Tensor, dt: float) -> tuple[Window, Equation]:
-        """The window with the state measured now, and the equation where it is complete.
-
-        Args:
-            state: until the measurement before.
-            x: (..., n), measured now; NaN where it was not.
-            dt: s since the measurement before.
-        """
+        """Return the window with x (..., n) measured now, NaN where it was not, and the equation where it
+        is complete; dt in s since the measurement before."""
 
     def holding(self, state: Window, u: Tensor) -> Window:
         """The window with the input that is held from now on, (..., m)."""

@@ -74,16 +74,8 @@ class BellmanTerms(NamedTuple):
 def bellman_terms(
     basis: ValueBasis, system: ControlAffineSystem, cost: Cost, points: Tensor, at: Tensor, actor: Tensor
 ) -> BellmanTerms:
-    """The terms at ``points`` for the actor weights.
-
-    Args:
-        basis: of the value function.
-        system: the model.
-        cost: the cost rate.
-        points: y, (..., P, n).
-        at: the states whose centers the points use, (..., P, n).
-        actor: Wa, (..., M).
-    """
+    """Return the terms at ``points`` y (..., P, n), whose centers stand around the states ``at`` (..., P,
+    n), for the actor weights Wa (..., M)."""
     gradient = basis.gradient(points, at)  # (..., P, M, n)
     g = system.effectiveness(points)
     value_gradient = (gradient * actor[..., None, :, None]).sum(-2)  # Ds'Wa, (..., P, n)

@@ -25,15 +25,9 @@ _TOGETHER = 1 << 16  # holds that are repeated at once
 
 @torch.no_grad()
 def needed(holding: Holding, x: Tensor, u: Tensor, frozen: Tensor, most: int = MOST) -> StepsNeeded:
-    """Return by how much rows must multiply their steps for 1e-6 in all of their holds.
-
-    Args:
-        holding: as it was.
-        x: states of K holds a row, (R, K, n).
-        u: controls, NaN where there was none, (R, K, m).
-        frozen: (R,) bool: rows that left the finite numbers.
-        most: steps of a hold.
-    """
+    """Return by how much rows must multiply their steps, ``most`` of a hold at most, for 1e-6 in all of
+    their holds: x (R, K, n), u (R, K, m), NaN where there was none; ``frozen`` (R,) left the finite
+    numbers."""
     known = torch.isfinite(u).all(-1) & torch.isfinite(x).all(-1)
     limit = torch.where(frozen.cpu(), min(most, _MOST_FROZEN), most) // holding.steps
 
@@ -61,18 +55,9 @@ def _errors(holding: Holding, rows: Tensor, x: Tensor, u: Tensor, known: Tensor)
 def hardest(
     holding: Holding, state: Tensor, control: Tensor, rest: Tensor, frozen: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the holds of every row in which the rate bends most, the first one, and where it froze.
-
-    Args:
-        holding: as it was.
-        state: (R, T, n).
-        control: (R, T, m), NaN where none was held.
-        rest: u that holds the set-point, (m,), for a row that froze in its first hold.
-        frozen: (R,) bool.
-
-    Returns:
-        (R, K, n), (R, K, m).
-    """
+    """Return the holds of every row in which the rate bends most, the first one, and where it froze:
+    states (R, T, n) and controls (R, T, m), NaN where none was held, -> (R, K, n), (R, K, m). ``rest``
+    (m,), which holds the set-point, stands for a row ``frozen`` (R,) in its first hold."""
     held = torch.isfinite(control[:, :-1]).all(-1)
     some = torch.arange(len(state), device=state.device).split(max(1, _TOGETHER // held.shape[1]))
     moves = state[:, :-1], control[:, :-1].nan_to_num(0.0)

@@ -174,12 +174,8 @@ def _tensors_of(policy: Any) -> dict[str, tuple[Tensor, int]]:
 
 
 class ControllerOfKinds(Controller):
-    """Controllers of rows with numbers of their own that are of several kinds: every row has its kind's.
-
-    Args:
-        kinds: of the same sizes.
-        kind: which of them a row has.
-    """
+    """Controllers, of the same sizes, of rows with numbers of their own that are of several kinds: every
+    row has that of its ``kind``."""
 
     def __init__(self, kinds: Sequence[Controller], kind: Tensor) -> None:
         super().__init__()

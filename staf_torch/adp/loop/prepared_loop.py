@@ -50,17 +50,11 @@ class LoopSettings(NamedTuple):
 
 
 class LoopTraits(NamedTuple):
-    """What the parts of a loop say of its steps.
+    """What the parts of a loop say of its steps."""
 
-    Attributes:
-        work: of a step of the controller, in steps of a feedback law.
-        costly: whether a program of a step takes a compiler very long.
-        generated: whether random numbers come from a generator a row.
-    """
-
-    work: float
-    costly: bool
-    generated: bool
+    work: float  # of a step of the controller, in steps of a feedback law
+    costly: bool  # whether a program of a step takes a compiler very long
+    generated: bool  # whether random numbers come from a generator a row
 
     @classmethod
     def of(cls, loop: ClosedLoop) -> LoopTraits:
@@ -73,18 +67,11 @@ class LoopTraits(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class PreparedLoop:
-    """A loop that has been checked.
+    """A loop that has been checked."""
 
-    Attributes:
-        loop: one step.
-        settings: of it.
-        silent: whether the checks had nothing to say.
-        traits: of its parts.
-    """
-
-    loop: ClosedLoop
+    loop: ClosedLoop  # one step
     settings: LoopSettings
-    silent: bool
+    silent: bool  # whether the checks had nothing to say
     traits: LoopTraits
     _compiled: list[Program] = dataclasses.field(default_factory=list)
 
@@ -135,13 +122,8 @@ def known(key: Hashable) -> PreparedLoop | None:
 
 
 def remember(key: Hashable, ready: PreparedLoop, *parts: Any) -> None:
-    """Keep a loop that runs for the second time.
-
-    Args:
-        key: of `key_of`.
-        ready: the loop.
-        parts: controller, plant and cost.
-    """
+    """Keep a loop of a key of `key_of` that runs for the second time; ``parts`` are controller, plant and
+    cost."""
     if key is None or not ready.silent:
         return
     if _once.pop(key, None) is None:  # to read all of it takes as long as a few steps
@@ -163,16 +145,8 @@ def prepared(
     *,
     learned: bool,
 ) -> PreparedLoop:
-    """Check a loop and its initial states, and make it.
-
-    Args:
-        controller, system, cost, x0: as in `simulate`.
-        settings: likewise.
-        learned: whether a gradient is wanted.
-
-    Raises:
-        ValueError: as `simulate`.
-    """
+    """Check a loop and its initial states, as `simulate` says, and make it; ``learned`` where a gradient
+    is wanted."""
     dt, substeps = settings.dt, settings.substeps
     with torch.no_grad():
         cost, silent = _check(system, cost, x0)

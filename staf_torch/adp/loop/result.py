@@ -161,19 +161,11 @@ class LoopAbout:
         cls,
         controller: Controller,
         system: Plant,
-        cost: Cost,
-        period: float | None,
-        run: Callable[[Controller, Tensor], LoopResult],
+        cost: Cost,  # around the plant; its bounds are drawn where the controller was made with none
+        period: float | None,  # for which a control is held, s; None where it follows the state
+        run: Callable[[Controller, Tensor], LoopResult],  # the loop of another controller, from other states
     ) -> LoopAbout:
-        """Return it of a loop.
-
-        Args:
-            controller: as in `simulate`.
-            system: likewise.
-            cost: around the plant; its bounds are drawn where the controller was made with none.
-            period: for which a control is held, s; None where it follows the state.
-            run: the loop of another controller, from other states.
-        """
+        """Return it of a loop, with arguments as in `simulate`."""
         clock = isinstance(system, Clocked)
         itself = isinstance(controller, Feedback) and isinstance(controller.policy, LQR)
         plant = type(system.plant if isinstance(system, Clocked) else system).__name__
@@ -289,11 +281,7 @@ def _far(result: LoopResult) -> Tensor | None:
 
 
 def picture(result: LoopResult, rows: Sequence[int] | None, lqr: bool) -> LoopPicture:
-    """Return what `LoopResult.figure` draws.
-
-    Raises:
-        ValueError: if a row is not there.
-    """
+    """Return what `LoopResult.figure` draws; a row that is not there is refused."""
     about, count = result.about, len(result.state)
     chosen = list(range(min(count, _DRAWN))) if rows is None else [int(row) for row in rows]
     if not chosen or not all(-count <= row < count for row in chosen):

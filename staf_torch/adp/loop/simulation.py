@@ -172,12 +172,8 @@ class _LoopRun:
     progress: Callable[[int], None] | None
 
     def accurate(self, ready: PreparedLoop, learned: bool) -> LoopResult:
-        """Return the result, in which rows that are too fast for their steps took more, if they may.
-
-        Args:
-            ready: the loop.
-            learned: whether a gradient is wanted.
-        """
+        """Return the result, in which rows that are too fast for their steps took more, if they may;
+        ``learned`` where a gradient is wanted."""
         loop, settings = ready.loop, ready.settings
         with torch.set_grad_enabled(learned):
             result, last = self.of(loop, ready.traits, ready.program)
@@ -198,13 +194,8 @@ class _LoopRun:
     def of(
         self, loop: ClosedLoop, traits: LoopTraits, make: Callable[[bool], Program] | None = None
     ) -> tuple[LoopResult, LoopState]:
-        """Return the result of a loop and its last state.
-
-        Args:
-            loop: one step.
-            traits: of its parts.
-            make: its program, compiled or not; None for `program`.
-        """
+        """Return the result of a loop and its last state; ``make`` is its program, compiled or not, by
+        default `program`."""
         costly, work = traits.costly, self.steps * (loop.holding.steps + traits.work - 1)
         often = DIFFERENTIATED if torch.is_grad_enabled() else 1  # as `simulate` found out
         pays = not costly and often * work * (1 + len(self.x0) / 200) >= _PAYS

@@ -175,13 +175,10 @@ def _where(alive: Tensor, new: Tensor, old: Tensor) -> Tensor:
 
 
 def program(loop: ClosedLoop, compile: bool) -> Program:
-    """Return ``loop`` over many steps: it records the state before every step, and the control.
+    """Return ``loop`` over many steps, compiled where that is possible and asked for: it records the state
+    before every step, and the control.
 
     Compiled loops that differ in numbers alone share one text: `lanes.told_numbers`.
-
-    Args:
-        loop: one step.
-        compile: whether to compile it at all; what cannot be compiled runs in plain torch.
     """
     make = functools.partial(functools.partial, recorded)
     if not compile:
@@ -192,14 +189,9 @@ def program(loop: ClosedLoop, compile: bool) -> Program:
 def recorded(
     loop: ClosedLoop, state: LoopState, uniform: Tensor, row: Mapping[str, Tensor]
 ) -> tuple[LoopState, Record]:
-    """Return the state after one step, and what is recorded of the time before it.
-
-    Args:
-        loop: one step.
-        state: before the step.
-        uniform: its random numbers, (B, draws, n).
-        row: by ``seed`` the parts of each row's seed, (B, 4), by which its numbers are drawn here instead.
-    """
+    """Return the state after one step with random numbers (B, draws, n), and what is recorded of the time
+    before it. ``row`` may have by ``seed`` the parts of each row's seed, (B, 4), by which they are drawn
+    here instead."""
     if "seed" in row:
         uniform = points_of_step(row["seed"], state.lived, loop.controller.draws, state.x.shape[-1])
     after, u = loop(state, uniform)

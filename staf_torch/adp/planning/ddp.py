@@ -407,13 +407,8 @@ class Model(NamedTuple):
 
 
 def _rounding(plan: SearchState, known: Derivatives, curvature: Tensor) -> Tensor:
-    """The cost of relative errors of `_ROUNDED` rounding units in every state and control of a plan, (B,).
-
-    Args:
-        plan: states and controls.
-        known: derivatives along it.
-        curvature: of the value along it, (B, T, n, n).
-    """
+    """Return the cost of relative errors of `_ROUNDED` rounding units in every state and control of a
+    plan, (B,), by the derivatives and the curvature of the value (B, T, n, n) along it."""
     state, control = plan.state[:, :-1].abs(), plan.control.abs()
     size = control.shape[-1]
     pulled = (curvature.abs() * state.unsqueeze(-2)).sum(-1)

@@ -38,14 +38,9 @@ class DetourPlan(NamedTuple):
 
 
 class PlanProblem:
-    """J of a plan over T periods, and how it is lowered.
-
-    Args:
-        detours: plant, constraints with their margins, period, T and V_T.
-        cost: the rate of J.
-        moved: p: the inputs move the first p states.
-        weight: of squares of what is missing of the margins.
-    """
+    """J of a plan over T periods, and how it is lowered: plant, constraints with their margins, period, T
+    and V_T are those of the detours; the inputs move the first p states; ``weight`` is that of squares of
+    what is missing."""
 
     def __init__(self, detours: DetourRollout, cost: QuadraticCost, moved: int, weight: float) -> None:
         self.detours, self.plant, self.cost = detours, detours.plant, cost

@@ -357,18 +357,15 @@ class GlobalValue(KeptPrecision):
 
 
 def follow_plan(
-    problem: SampledProblem, region: Tensor, worst: float, x: Tensor, window: Tensor, end: Tensor
+    problem: SampledProblem,
+    region: Tensor,  # half the width of the box of states, (n,)
+    worst: float,  # the largest value that is remembered, added where the plan is lost
+    x: Tensor,
+    window: Tensor,  # state, control and feedback of H steps, (B, H, n + m + m n)
+    end: Tensor,  # state, value, gradient and curvature after them, (B, n + 1 + n + n n)
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Cost (B,), first control (B, m) and arrival (B,) bool of following a plan, a row each.
-
-    Args:
-        problem: plant, cost and bounds in steps.
-        region: half the width of the box of states, (n,).
-        worst: the largest value that is remembered, added where the plan is lost.
-        x: (B, n).
-        window: state, control and feedback of H steps, (B, H, n + m + m n).
-        end: state, value, gradient and curvature after them, (B, n + 1 + n + n n).
-    """
+    """Return cost (B,), first control (B, m) and arrival (B,) bool of following a plan from x (B, n), a
+    row each."""
     n = problem.dim
 
     def step(now: tuple[Tensor, Tensor], plan: Tensor) -> tuple[tuple[Tensor, Tensor], tuple[()]]:

@@ -150,14 +150,8 @@ def swept(memory: GlobalValue, search: BoxDDP) -> Trajectories:
 
 
 def best_from(memory: GlobalValue, search: BoxDDP, x: Tensor, own: Tensor | None = None) -> Trajectories:
-    """The best trajectories from x (B, n) that the search reaches from plans of the memory.
-
-    Args:
-        memory: of which plans are followed.
-        search: that optimises them.
-        x: (B, n).
-        own: a trajectory for each state that must not help it, (B,).
-    """
+    """Return the best trajectories from x (B, n) that the search reaches from plans of the memory;
+    ``own`` (B,) is a trajectory for each state that must not help it."""
     guesses = _guesses(memory, search.steps, x, own)
     with some_rows(guesses.owner):
         found = search.solve(x[guesses.owner], guesses.control, guesses.reference)
@@ -244,12 +238,8 @@ def box_of(plant: Plant, dim: int) -> Tensor:
 
 
 def global_value_of(problem: SampledProblem, width: Tensor, steps: int) -> GlobalValue:
-    """The global value of a box, in seconds for two states and up to some minutes for four.
-
-    Args:
-        problem: plant, cost and bounds in steps.
-        width: half the width of the box, (n,).
-        steps: of a trajectory, to begin with: twice as many where fewer than nine of ten arrive.
+    """Return the global value of the box of half widths (n,), in seconds for two states and up to some
+    minutes for four; trajectories have twice as many steps where fewer than nine of ten arrive.
 
     Raises:
         ValueError: if no trajectory arrives.

@@ -209,14 +209,9 @@ def _following(found: Trajectories) -> Following:
 
 
 class BoundedPlans:
-    """u_0 of the cheapest plan over T periods by `BoxDDP`, begun from the linear feedback of the goal and
-    from each corner of the bounds that is held for 2 to 30 periods before it.
-
-    Args:
-        problem: plant, cost and bounds in steps.
-        steps: T.
-        policy: whose base is the linear feedback.
-    """
+    """u_0 of the cheapest plan over T periods by `BoxDDP`, begun from the linear feedback of the goal,
+    which is the base of the policy, and from each corner of the bounds that is held for 2 to 30 periods
+    before it."""
 
     def __init__(self, problem: SampledProblem, steps: int, policy: SampledRollout) -> None:
         self.problem, self.steps, self.policy = problem, steps, policy
@@ -237,17 +232,14 @@ class BoundedPlans:
 
 
 class StrainedPlans(Controller):
-    """u = policy(x), but a plan's where the linear feedback of the goal, followed from x, would meet a bound.
+    """u = policy(x), but a plan's where the linear feedback of the goal, followed from x, would meet a
+    bound.
 
     There a row carries a plan from control to control and improves it on the way, until the linear feedback
-    meets no bound any more. That the plan is carried matters: two ways around that cost nearly the same would
-    take turns, were each control decided anew. Where this is so at the beginning, the first plan is the best
-    of several, which `init` finds before the loop; in the loop there is no time for this, and a plan begins
-    from the linear feedback.
-
-    Args:
-        policy: of the other states; its base is the linear feedback.
-        planner: of its plant, cost and bounds; it knows where bounds are met.
+    meets no bound any more. That the plan is carried matters: two ways around that cost nearly the same
+    would take turns, were each control decided anew. Where this is so at the beginning, the first plan is
+    the best of several, which `init` finds before the loop; in the loop there is no time for this, and a
+    plan begins from the linear feedback, the base of the policy.
     """
 
     def __init__(self, policy: SampledRollout, planner: BoundedPlans) -> None:

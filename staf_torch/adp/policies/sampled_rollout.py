@@ -344,15 +344,8 @@ class FollowedSimulator:
 
 
 def followed(plant: Plant, base: Policy, bounds: Bounds, period: float) -> FollowedSimulator | None:
-    """Return what follows a policy through a user's simulator; None of other plants, or where the plant
-    does more than its function.
-
-    Args:
-        plant: the plant.
-        base: the policy, which is clipped to the bounds.
-        bounds: of the inputs.
-        period: s, for which a control is held.
-    """
+    """Return what follows a policy, clipped to the bounds, through a user's simulator; None of other
+    plants, or where the plant does more than its function."""
     if plant.traceable or not isinstance(plant, StepPlant) or plant.period != period:
         return None
     return FollowedSimulator(plant, base, bounds) if type(plant).step is StepPlant.step else None

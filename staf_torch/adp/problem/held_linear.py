@@ -43,19 +43,9 @@ class Hold(NamedTuple):
 
 @designed_on_cpu
 def exact_hold(f: Tensor, g: Tensor, q: Tensor, r: Tensor, period: float, *, discount: float = 0.0) -> Hold:
-    """Return x' = F x + G u and the integral of x'Qx + u'Ru over one period with u held.
-
-    Args:
-        f: F, (n, n), in 1/s.
-        g: G, (n, m).
-        q: Q, (n, n).
-        r: R, (m, m).
-        period: dt, s, positive.
-        discount: rho, 1/s: A and B are then those of exp(-rho t / 2) (x, u), and what is paid is discounted.
-
-    Raises:
-        ValueError: if the period is not positive.
-    """
+    """Return x' = F x + G u, F (n, n) in 1/s, and the integral of x'Qx + u'Ru over one period with u
+    held. With a discount rho, 1/s, A and B are those of exp(-rho t / 2) (x, u), and what is paid is
+    discounted."""
     positive_real("exact_hold", "period", period)
     n, m = g.shape
     whole = pad(torch.cat((f, g), dim=1).double(), (0, 0, 0, m))
@@ -67,11 +57,8 @@ def exact_hold(f: Tensor, g: Tensor, q: Tensor, r: Tensor, period: float, *, dis
 
 
 def periods(call: str, plant: Plant, dt: float) -> int:
-    """Return the number of steps of a plant in discrete time that make ``dt`` seconds.
-
-    Raises:
-        ValueError: if it is not a whole number, at least 1.
-    """
+    """Return the number of steps of a plant in discrete time that make ``dt`` seconds, refused unless it
+    is whole."""
     assert plant.period is not None
     count = round(dt / plant.period)
     if count < 1 or abs(count * plant.period - dt) > 1e-9 * dt:
@@ -81,18 +68,9 @@ def periods(call: str, plant: Plant, dt: float) -> int:
 
 
 def linear_hold(plant: Plant, cost: Cost, period: float) -> Hold:
-    """The linearised plant at the set-point over ``period`` seconds with u held, and what it pays.
-
-    With a discount rho A and B are those of exp(-rho t / 2) (x, u).
-
-    Args:
-        plant: in continuous or in discrete time.
-        cost: around the plant.
-        period: s; of a plant in discrete time a multiple of its own.
-
-    Raises:
-        ValueError: if the period breaks its rule.
-    """
+    """Return the linearised plant at the set-point over ``period`` seconds, of a plant in discrete time a
+    multiple of its own, with u held, and what it pays. With a discount rho A and B are those of exp(-rho
+    t / 2) (x, u)."""
     return _linear_hold(plant, cost, period, *plant.linearisation(cost.target, cost.target_input))
 
 
@@ -114,11 +92,6 @@ def _linear_hold(plant: Plant, cost: Cost, period: float, f: Tensor, g: Tensor) 
 
 def held_riccati(plant: Plant, cost: Cost, period: float) -> tuple[Tensor, Tensor]:
     """Return P and K of the best control of the linearised plant that is held: -K e, of the value e'Pe.
-
-    Args:
-        plant: in continuous or in discrete time.
-        cost: around the plant.
-        period: dt, s.
 
     Raises:
         ValueError: if the plant cannot be stabilised, at all or with this period, the cost does not see a

@@ -49,11 +49,8 @@ Substeps = int | tuple[int, int] | None
 
 
 def fewest_and_most(call: str, substeps: int | tuple[int, int]) -> tuple[int, int]:
-    """The numbers of integration steps, checked.
-
-    Raises:
-        ValueError: if they are no integers, or the most are fewer than the least.
-    """
+    """Return the numbers of integration steps, refused unless they are integers, the most no fewer than
+    the least."""
     least, most = (substeps, substeps) if isinstance(substeps, int) else substeps
     return (
         integer(call, "substeps", least, least=1),

@@ -37,11 +37,7 @@ _CONSTANTS = 0.5  # time constants of the slowest mode that a horizon must have
 
 
 def check_objects(call: str, *, cost: object, **plants: object) -> None:
-    """Refuse what is no plant, or no cost, of a door that takes these.
-
-    Raises:
-        ValueError: in the name of ``call`` and its argument; it says what to write.
-    """
+    """Refuse what is no plant, or no cost, of a door that takes these; the error says what to write."""
     object_of(call, Plant, _PLANTS, **plants)
     object_of(call, Cost, _COSTS, cost=cost)
 
@@ -53,11 +49,8 @@ def check_problem(plant: Plant, cost: Cost) -> None:
 
 
 def check_plant(plant: Plant) -> None:
-    """Refuse a plant whose rates are not those of rows, whatever their number.
-
-    Raises:
-        ValueError: that names the method and what it returned.
-    """
+    """Refuse a plant whose rates are not those of rows, whatever their number: the method, and what it
+    returned."""
     _check_spread(plant)
     if plant.dim is None or isinstance(plant, FunctionPlant) or is_ours(type(plant)):
         return  # a function was tried when its plant was made
@@ -84,11 +77,7 @@ def _check_torch(name: str, plant: ControlAffineSystem, x: Tensor) -> None:
 
 
 def _check_spread(plant: Plant) -> None:
-    """Refuse a ``spread`` of a plant that is no positive number, and not one a coordinate.
-
-    Raises:
-        ValueError: that names it.
-    """
+    """Refuse a ``spread`` of a plant that is no positive number, and not one a coordinate."""
     spread: object = plant.spread
     if isinstance(spread, int | float | RowNumbers):
         return
@@ -102,11 +91,7 @@ def _check_spread(plant: Plant) -> None:
 
 
 def check_cost(cost: Cost) -> None:
-    """Refuse a cost of a user whose rates are not numbers, one a row.
-
-    Raises:
-        ValueError: that names the method and what it returned.
-    """
+    """Refuse a cost of a user whose rates are not numbers, one a row: the method, and what it returned."""
     if is_ours(type(cost)):
         return
     name, x = type(cost).__name__, state_of(cost)
@@ -137,11 +122,7 @@ def state_of(cost: Cost) -> Tensor:
 
 
 def check_torch(call: str, argument: str, plant: Plant, *, continuous: bool = False) -> None:
-    """Refuse a plant with something that torch cannot differentiate, or one in discrete time.
-
-    Raises:
-        ValueError: in the name of ``call`` and its argument.
-    """
+    """Refuse a plant with something that torch cannot differentiate, or one in discrete time."""
     kind = "in torch all through" if not continuous else "in continuous time and in torch all through"
     if not plant.traceable or (continuous and plant.period is not None):
         rule = f"must be {kind}: trajectories are optimised by its second derivatives"
@@ -173,11 +154,8 @@ def check_regulator(call: str, argument: str, why: str) -> None:
 
 
 def held_period(call: str, plant: Plant, dt: float | None) -> float:
-    """Return the time for which a control is held, s: ``dt``, by default a step of a plant in discrete time.
-
-    Raises:
-        ValueError: if it is not positive, or nobody says it.
-    """
+    """Return the time for which a control is held, s: ``dt``, by default a step of a plant in discrete
+    time. Refused where it is not positive, or nobody says it."""
     period = plant.period if dt is None else dt
     if period is None:
         raise fail(call, "dt", "must be given, s: a plant in continuous time has no period of its own", dt)
@@ -192,20 +170,8 @@ def own_period(call: str, plant: Plant, dt: float | None) -> float:
 
 
 def check_within(call: str, argument: str, bounds: Bounds | None, u: Tensor) -> bool:
-    """Refuse bounds that do not contain the input which holds the plant at the set-point.
-
-    Args:
-        call: the door.
-        argument: of it.
-        bounds: of the inputs, None for none.
-        u: the input, (m,).
-
-    Returns:
-        False where it lies on a bound, of which a warning in the log tells.
-
-    Raises:
-        ValueError: if it lies outside.
-    """
+    """Refuse bounds that do not contain the input (m,) which holds the plant at the set-point. False
+    where it lies on a bound, of which a warning in the log tells."""
     if bounds is None:
         return True
     bounds = bounds.on(u.device)
@@ -224,17 +190,8 @@ def check_within(call: str, argument: str, bounds: Bounds | None, u: Tensor) -> 
 
 
 def regulated(call: str, plant: Plant, cost: Cost) -> Cost:
-    """Return the cost around the plant, of a door that regulates: the plant rests within the bounds.
-
-    Args:
-        call: the door.
-        plant: the plant.
-        cost: the cost rate.
-
-    Raises:
-        ValueError: if the sizes differ, the plant does not rest at the set-point, or its input is not within
-            the bounds.
-    """
+    """Return the cost around the plant, of a door that regulates. Refused where the sizes differ, the
+    plant does not rest at the set-point, or its input is not within the bounds."""
     check_problem(plant, cost)
     placed = cost.around(plant)
     _check_held(call, plant, placed)
@@ -249,13 +206,8 @@ def set_point(plant: Plant, cost: Cost) -> tuple[Tensor, Tensor]:
 
 
 def check_regulates(call: str, plant: Plant, cost: Cost) -> None:
-    """Refuse an economic cost: one whose rate is not 0 at the set-point, or less somewhere beside it.
-
-    Args:
-        call: the door.
-        plant: the plant.
-        cost: around it, of a path or a set-point.
-    """
+    """Refuse an economic cost, around a plant, of a path or a set-point: one whose rate is not 0 there,
+    or less somewhere beside it."""
     still_plant, still = cost.regulated(plant)
     x = set_point(still_plant, still)[0]
     near = _NEAR * (1 + x.abs()) * torch.eye(len(x), dtype=x.dtype, device=x.device)
@@ -273,12 +225,8 @@ def check_regulates(call: str, plant: Plant, cost: Cost) -> None:
 
 
 def restless(plant: Plant, cost: Cost) -> str:
-    """Return why nothing keeps a plant at the set-point of a cost at no cost; "" where something does.
-
-    Args:
-        plant: the plant.
-        cost: around it, of a path or a set-point.
-    """
+    """Return why nothing keeps a plant at the set-point of a cost around it at no cost; "" where
+    something does."""
     try:
         check_regulates("restless", plant, cost)
         _check_held("restless", plant, cost)
@@ -288,13 +236,8 @@ def restless(plant: Plant, cost: Cost) -> str:
 
 
 def warn_if_restless(call: str, plant: Plant, cost: Cost) -> bool:
-    """Say in the log that nothing holds a plant at the set-point of a cost, which is paid for ever then.
-
-    Nothing is said of an economic cost, which has no set-point.
-
-    Returns:
-        Whether nothing had to be said.
-    """
+    """Say in the log that nothing holds a plant at the set-point of a cost, which is paid for ever then;
+    True where nothing had to be said, as of an economic cost, which has no set-point."""
     try:
         check_regulates(call, plant, cost)
     except ValueError:
@@ -321,14 +264,8 @@ def slowest(policy: Callable[[Tensor], Tensor], plant: Plant, cost: Cost, period
 
 
 def warn_if_short(call: str, argument: str, horizon: float, decay: Tensor) -> None:
-    """Say in the log that a horizon ends before the loop has decayed once.
-
-    Args:
-        call: the door.
-        argument: that states the horizon.
-        horizon: s.
-        decay: of the slowest mode, 1/s, ().
-    """
+    """Say in the log that a horizon, s, ends before the loop has decayed once; the slowest mode does in
+    1/s, ()."""
     if bool(horizon * decay < _CONSTANTS):
         decay = of_first(decay)
         _log.warning(

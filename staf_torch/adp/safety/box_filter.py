@@ -277,13 +277,8 @@ def _degrees(box: Barrier) -> list[int]:
 
 
 def walls(low: Sequence[float], high: Sequence[float]) -> list[Constraint]:
-    """h of every coordinate with a wall, in its units: (x - low)(high - x)/(high - low), or the distance to
-    its one wall.
-
-    Args:
-        low: of the n coordinates, -inf for no wall.
-        high: likewise, inf for none.
-    """
+    """Return h of every coordinate with a wall, in its units, of n limits, infinite for none: (x -
+    low)(high - x)/(high - low), or the distance to its one wall."""
     pairs = enumerate(zip(low, high, strict=True))
     return [_within(k, *pair) for k, pair in pairs if not all(map(math.isinf, pair))]
 

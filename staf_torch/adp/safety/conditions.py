@@ -69,14 +69,8 @@ class Ends(NamedTuple):
 
 
 class Conditions(nn.Module):
-    """Conditions on a held control that keep h_i(x, t) >= margin_i, one row and constraint at a time.
-
-    Args:
-        plant, constraints, bounds, hold, decay, degree, margin: as in `SafetyFilter`.
-
-    Raises:
-        ValueError: if one breaks its rule.
-    """
+    """Conditions on a held control that keep h_i(x, t) >= margin_i, one row and constraint at a time,
+    with arguments and rules of `SafetyFilter`."""
 
     def __init__(
         self,

@@ -49,14 +49,10 @@ class Chosen(NamedTuple):
 
 
 class LookAhead(nn.Module):
-    """Choose between controls by what follows them.
+    """Choose between controls by what follows them; a policy that remembers, None here, is not followed.
 
     Attributes:
         periods: for which the policy is followed at most; a row with numbers of its own has its ``count``.
-
-    Args:
-        conditions: of the filter.
-        policy: u from x; None for one that remembers, which is not followed.
     """
 
     largest = ("periods",)
@@ -113,13 +109,8 @@ class LookAhead(nn.Module):
         return where_rows(strain > 0, urgent, (x, u, t), torch.zeros_like(t)) > 0
 
     def choose(self, policy: Policy | None, given: tuple[Tensor, ...], where: Tensor) -> Chosen:
-        """The first control whose consequences are fine, else the one of the best, in the rows asked for.
-
-        Args:
-            policy: as in the constructor.
-            given: the wanted control (B, m), the one of the conditions (B, m), x (B, n) and t (B,).
-            where: (B,) bool.
-        """
+        """Return the first control whose consequences are fine, else the one of the best, in the rows
+        ``where`` (B,)."""
         wanted, found, x, t = given
         none = torch.zeros_like(t)
         start = wanted, found, x, t, found, none - math.inf, none, where

@@ -50,15 +50,8 @@ class Nearest(NamedTuple):
 
 
 def cases(count: int, low: Sequence[float], high: Sequence[float]) -> Tensor:
-    """Which inequalities (1 or 0) and which bounds (-1 low, 1 high, 0 none) may hold with equality.
-
-    Args:
-        count: k, of inequalities.
-        low: m lower bounds, -inf for none.
-        high: m upper bounds.
-
-    Returns:
-        (P, k + m) float64, at first the case of none.
+    """Return which inequalities (1 or 0) of ``count`` and which of m bounds (-1 low, 1 high, 0 none),
+    infinite for none, may hold with equality: (P, k + m) float64, at first the case of none.
 
     Raises:
         ValueError: if there are more than a thousand cases.
@@ -87,25 +80,20 @@ def sides_of(bounds: Bounds) -> tuple[list[float], list[float]]:
 def nearest_admissible(
     wanted: Tensor, normals: Tensor, least: Tensor, low: Tensor, high: Tensor, table: Tensor
 ) -> Nearest:
-    """argmin |u - wanted|^2 over low <= u <= high with a_i'u >= c_i, i = 1..k.
+    """argmin |u - wanted|^2 over low <= u <= high with a_i'u >= c_i, i = 1..k; NaN where an input is NaN.
 
-    Where no u satisfies all, the bounds hold and the squares of (c_i - a_i'u) / |a_i| have the least sum; for
-    one unknown, the largest of them is least. One unknown is an interval. For two the solution is on one of
-    the edges or where two of them meet: the nearest of these points that satisfies all. For more the
-    stationary points of all cases are compared: with multipliers l >= 0 the solution is
-    u = clip(wanted + A'l), and the case that satisfies all of these conditions best is it. A ``wanted`` that
-    is admissible is returned as it is.
+    Where no u satisfies all, the bounds hold and the squares of (c_i - a_i'u) / |a_i| have the least sum;
+    for one unknown, the largest of them is least. One unknown is an interval. For two the solution is on one
+    of the edges or where two of them meet: the nearest of these points that satisfies all. For more the
+    stationary points of all cases are compared: with multipliers l >= 0 the solution is u = clip(wanted +
+    A'l), and the case that satisfies all of these conditions best is it. A ``wanted`` that is admissible is
+    returned as it is.
 
     Args:
-        wanted: (..., m).
+        wanted: (..., m), beside it ``low`` and ``high``, (m,), infinite for none.
         normals: a_i, (..., k, m); a zero normal is an inequality that u cannot change.
         least: c_i, (..., k).
-        low: (m,), -inf for none.
-        high: (m,), inf for none.
         table: of `cases`.
-
-    Returns:
-        NaN where an input is NaN.
     """
     length = normals.square().sum(-1).sqrt()
     length = torch.where(length == 0, 1.0, length)

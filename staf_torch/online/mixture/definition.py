@@ -40,13 +40,8 @@ Views = dict[str, Tensor]
 
 
 class BankDefinition:
-    """The methods of the compiled bank on a table (S, size), in place.
-
-    Args:
-        shape: sizes.
-        rules: constants.
-        functions: local functions of the carried filters.
-    """
+    """The methods of the compiled bank on a table (S, size), in place; ``functions`` are those of the
+    carried filters."""
 
     def __init__(self, shape: BankShape, rules: Rules, functions: LocalFunctions) -> None:
         self.shape, self.rules, self.functions = shape, rules, functions
@@ -402,14 +397,9 @@ def _trackers(s: Views) -> TrackerModels:
 
 
 def _processes(kernels: Tensor, noise: Tensor, rest: Tensor, line: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Gaussian processes at the last of k + 1 points from the others, by elimination.
-
-    Args:
-        kernels: (members, k + 1, k + 1).
-        noise: variances in units of the amplitudes, (members,).
-        rest: values, (members, K, k).
-        line: what is added to the means, (K,).
-    """
+    """Return Gaussian processes at the last of k + 1 points from the others, by elimination: kernels
+    (members, k + 1, k + 1), noise in units of the amplitudes (members,), values ``rest`` (members, K, k),
+    ``line`` (K,) added to the means."""
     a, count = kernels.clone(), kernels.shape[-1] - 1
     a[:, :count, :count] += noise[:, None, None] * torch.eye(count, dtype=a.dtype, device=a.device)
     seen, mean = torch.zeros_like(noise), torch.zeros_like(rest[..., 0])

@@ -112,15 +112,8 @@ def _learn_map(r: Rules, s: dict[str, Tensor], value: Tensor, told: Tensor) -> N
 
 
 def judge(r: Rules, s: dict[str, Tensor], value: Tensor, told: Tensor, t: float) -> None:
-    """The members and their mixtures are judged by their prediction of value (K,), where it was told.
-
-    Args:
-        r: the constants.
-        s: parts of a stream.
-        value: (K,).
-        told: (K,) bool.
-        t: samples learned so far.
-    """
+    """Judge the members and their mixtures by their prediction of value (K,), where it was told (K,)
+    bool; t samples were learned so far."""
 
     def put(name: str, new: Tensor) -> None:
         s[name].copy_(torch.where(told.view(-1, *[1] * (new.dim() - 1)), new, s[name]))

@@ -154,12 +154,8 @@ class Bank:
         return {"table": self.table.clone()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Take over what `state_dict` of as many streams has.
-
-        Raises:
-            ValueError: if the table has another shape, dtype or device, or numbers that no bank has written:
-                compiled code goes by them.
-        """
+        """Take over what `state_dict` of as many streams has; refused where the table has another shape,
+        dtype or device, or numbers that no bank has written: compiled code goes by them."""
         table = table_of(state)
         refuse_other({"table": table}, {"table": self.table}, self.table.shape[1], table.shape[1])
         refuse_unwritten(self.shape, table)

@@ -189,11 +189,8 @@ def size(fields: list[tuple[str, tuple[int, ...]]]) -> int:
 
 
 def refuse_unwritten(shape: BankShape, table: Tensor) -> None:
-    """Refuse a saved table (S, size) with numbers that no bank writes and that compiled code goes by.
-
-    Raises:
-        ValueError: where a number of samples or a place is out of range, or a sample is not finite.
-    """
+    """Refuse a saved table (S, size) with numbers that no bank writes and that compiled code goes by: a
+    number of samples or a place out of range, a sample that is not finite."""
     named = parts(layout(shape), table)
     count, turns = named["count"], named["tracker_counts"][:, -1]
     rules = {

@@ -124,9 +124,7 @@ def test_one_stiff_row_takes_its_own_steps_and_changes_no_other(caplog: pytest.L
 @pytest.mark.parametrize("kind", [adp.ExtendedKalman, adp.UnscentedKalman])
 def test_kalman_filters_of_a_stiff_plant_have_the_deviation_of_the_exact_step(kind: Any) -> None:
     found = kind(MOTOR, lambda x: x[..., :1], noise=[0.01], process=0.1)
-    belief = adp.estimation.Belief(
-        torch.zeros(1, 2).double(), torch.eye(2).double()[None], tensor([[0.0]])
-    )
+    belief = adp.estimation.Belief(torch.zeros(1, 2).double(), torch.eye(2).double()[None], tensor([[0.0]]))
     f = torch.linalg.matrix_exp(0.02 * torch.stack((MOTOR.matrix, MOTOR.matrix)))[0]
     p = torch.eye(2).double()
     for _ in range(50):

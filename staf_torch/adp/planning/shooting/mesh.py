@@ -44,17 +44,8 @@ def halved(time: Tensor) -> Tensor:
 
 
 def split(stage: Interval, plan: MeshPlan, feedback: Tensor, lengths: Tensor) -> tuple[MeshPlan, Tensor]:
-    """Split the intervals of a plan in half: the same control, and a feedback around it.
-
-    Args:
-        stage: of the problem.
-        plan: on N intervals.
-        feedback: around it, (B, N, 2m, n).
-        lengths: of the N intervals, (N,).
-
-    Returns:
-        A plan on 2N intervals (of the old cost) and its feedback (B, 2N, 2m, n).
-    """
+    """Split the N intervals of a plan, of these lengths (N,), in half: the same control and a feedback
+    around it, (B, N, 2m, n) -> (B, 2N, 2m, n); the cost is the old one."""
     first, last = plan.control.chunk(2, dim=-1)
     middle = 0.5 * (first + last)
     early, late = torch.cat((first, middle), dim=-1), torch.cat((middle, last), dim=-1)
@@ -73,17 +64,8 @@ def rates_of(system: Plant, lqr: LQR) -> tuple[Tensor, Tensor]:
 
 
 def regulator(system: Plant, cost: Cost, horizon: float | None, ends: bool) -> LQR | None:
-    """The LQR of a problem; None where there is none and a horizon does without.
-
-    Args:
-        system: the plant.
-        cost: the cost rate, around the plant.
-        horizon: s, as it was given.
-        ends: whether a plan would end with its value.
-
-    Raises:
-        ValueError: if there is neither an LQR nor a horizon.
-    """
+    """Return the LQR of a problem; None where there is none and a horizon, s, does without, with a
+    warning if a plan ``ends`` with its value. Neither an LQR nor a horizon is refused."""
     try:
         decided(lambda: check_regulates("DirectShooting", system, cost))
         return LQR(system, cost)
@@ -128,11 +110,7 @@ def end_value(terminal: Value | Matrix | None, cost: Cost, lqr: LQR | None) -> V
 def times(
     system: Plant, cost: Cost, lqr: LQR | None, horizon: float | None, intervals: int | None
 ) -> tuple[float, int]:
-    """The horizon, s, and the even number of its intervals, checked.
-
-    Raises:
-        ValueError: if one of them breaks its rule.
-    """
+    """Return the horizon, s, and the even number of its intervals, checked."""
     slowest, fastest = 1.0, 0.0
     if lqr is not None:
         slow, fast = numbers_of_rows(lambda: rates_of(system, lqr)).numbers

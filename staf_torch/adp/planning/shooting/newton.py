@@ -41,14 +41,9 @@ class Expansion(NamedTuple):
 
 
 class Interval:
-    """x+ = F(x, v) and the cost l(x, v) of an interval on which the input runs linearly from v's first half
-    to its second, by one Runge-Kutta step. A smoothly bounded input is the saturated v; a hard bound is one
-    of v itself.
-
-    Args:
-        system: the plant.
-        cost: the cost rate.
-    """
+    """x+ = F(x, v) and the cost l(x, v) of an interval on which the input runs linearly from v's first
+    half to its second, by one Runge-Kutta step. A smoothly bounded input is the saturated v; a hard bound
+    is one of v itself."""
 
     def __init__(self, system: Plant, cost: Cost) -> None:
         self.system, self.cost = system, cost
@@ -74,15 +69,11 @@ class Interval:
         return found
 
     def gap(self, x: Tensor, v: Tensor, costate: Tensor) -> Tensor:
-        """Return how much the Hamiltonian r + p'f of a control exceeds its minimum over the admissible ones.
+        """Return how much the Hamiltonian r + p'f of a half of a control (..., m) exceeds its minimum over
+        the admissible ones, at x and p (..., n).
 
         It is measured in u, so that a saturated control that should be another is seen, which the slope in v
         is not. Of a plant that is not affine in u it is measured along the slope there.
-
-        Args:
-            x: (..., n).
-            v: half of a control, (..., m).
-            costate: p, (..., n).
         """
         u = self.input(v)
         with torch.no_grad():
@@ -184,15 +175,9 @@ class Direction(NamedTuple):
 def direction(
     expansion: Expansion, end: Tensor, end_curvature: Tensor, room: tuple[Tensor, Tensor] | None = None
 ) -> Direction:
-    """The minimiser of the quadratic model, backwards in time.
-
-    Args:
-        expansion: of the current plan.
-        end: dV_T/dx at its last state, (B, n).
-        end_curvature: the second derivative there, (B, n, n).
-        room: how far v may fall and rise, (B, N, 2m) each; None where it is not bounded. A control at a bound
-            that the model pushes outward stays there, and gets no feedback.
-    """
+    """Return the minimiser of the quadratic model, backwards in time from the derivatives (B, n), (B, n,
+    n) of V_T at the plan's end. A control at the end of its ``room``, how far v may fall and rise, (B, N,
+    2m) each, that the model pushes outward stays there, and gets no feedback."""
     slope, gradient, curvature = expansion
     costate, bent = end, end_curvature
     decrement, definite = torch.zeros_like(end[:, 0]), torch.ones_like(end[:, 0], dtype=torch.bool)

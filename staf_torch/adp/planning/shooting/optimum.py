@@ -61,12 +61,8 @@ class Optimum(NamedTuple):
 
 
 class PlanReplay(Controller):
-    """u(t) of a plan that is linear on each interval, averaged over each period; its last value afterwards.
-
-    Args:
-        time: (N + 1,) seconds, from 0.
-        plan: (B, N, 2, m), u at the start and the end of every interval.
-    """
+    """u(t) of a plan (B, N, 2, m), u at the start and the end of every interval between times (N + 1,)
+    from 0, linear on each, averaged over each period; its last value afterwards."""
 
     def __init__(self, time: Tensor, plan: Tensor) -> None:
         super().__init__()

@@ -46,17 +46,9 @@ class StartControl(NamedTuple):
 def guesses(
     cost: Cost, base: Policy, x0: Tensor, horizon: float, count: int, seed: int, *, alone: bool = False
 ) -> list[StartControl]:
-    """Constant controls at both bounds for several times, none at all, and random splines.
-
-    Args:
-        cost: with the bounds.
-        base: that takes over after each.
-        x0: the states, (B, n).
-        horizon: s.
-        count: random splines.
-        seed: of them.
-        alone: whether the base is the input at rest: it does not say how large a control is.
-    """
+    """Return constant controls at both bounds for several times, none at all, and ``count`` random
+    splines; the base takes over after each. ``alone`` says that it is the input at rest, which does not
+    say how large a control is."""
     rest = torch.zeros(cost.inputs, dtype=torch.float64, device="cpu")
     rest = rest if cost.target_input is None else cost.target_input
     wanted = (base(x0) - rest.to(x0)).abs().amax(0).clamp(min=1.0 if alone else 1e-3).to(rest)
@@ -95,13 +87,8 @@ def guided(guess: StartControl, base: Policy) -> Callable[[Tensor, float], Tenso
 
 
 class PlanSearch:
-    """Plans from states, the controls held for a step each.
-
-    Args:
-        problem: the plant, its cost and bounds in steps.
-        width: half the width of the box of the memory, (n,).
-        steps: T.
-    """
+    """Plans from states over T steps, the controls held for a step each; ``width`` (n,) is half that of
+    the memory's box."""
 
     def __init__(self, problem: SampledProblem, width: Tensor, steps: int) -> None:
         self.problem, self.width, self.steps = problem, width, steps
@@ -138,15 +125,11 @@ class PlanSearch:
 
 
 def cheapest(plans: list[MeshPlan], count: int, used: Tensor) -> list[MeshPlan]:
-    """The ``count`` cheapest of several plans that differ from each other and from one used, row by row.
+    """Return the ``count`` cheapest plans that differ from each other and from one of the cost ``used``
+    (B,), row by row.
 
     Two that cost the same are mirror images, or one and the same: they would find the same, and agree with
     nobody but themselves. All but the first of them come last, as plans that cost inf.
-
-    Args:
-        plans: of the rows.
-        count: at most.
-        used: cost of the plan that was improved already, (B,).
     """
     costs = torch.stack([used, *(plan.cost for plan in plans)])  # (1 + S, B)
     apart = (costs.unsqueeze(1) - costs).abs() > _MIRRORED * costs.abs()
@@ -212,15 +195,8 @@ def dearer(value: Tensor, followed: Tensor) -> Tensor:
 
 
 def replaced(found: Optimum, rows: Tensor, again: Optimum, believed: Tensor, followed: Tensor) -> Optimum:
-    """Join what was found with what was found from the base in some rows, or NaN where that costs more too.
-
-    Args:
-        found: B rows.
-        rows: in it, (B',).
-        again: from the base in these rows.
-        believed: rows of these where one start is enough, (B',) bool.
-        followed: cost of following the base there, (B',).
-    """
+    """Join what was found with what was found ``again`` from the base in some rows (B',), or NaN where
+    that costs more than following the base does; one start is enough where it is ``believed`` (B',)."""
     lost = ~torch.isfinite(again.value) | dearer(again.value, followed)
     columns, reasons = {}, list(found.reason)
     for name, whole in _tensors(found).items():
@@ -251,11 +227,7 @@ def _stationary(optimum: Optimum) -> Tensor:
 
 
 def joined(parts: list[Optimum]) -> Optimum:
-    """Results of pieces of a batch.
-
-    Raises:
-        ValueError: if a piece needed a longer horizon than another.
-    """
+    """Join results of pieces of a batch, refused if a piece needed a longer horizon than another."""
     longest = max(parts, key=lambda part: float(part.time[-1])).time
     if any(not torch.equal(part.time, longest) for part in parts):
         raise ValueError(
