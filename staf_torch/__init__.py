@@ -48,7 +48,7 @@ if TYPE_CHECKING:  # for type checkers and editors; the tables below say it agai
     from .kernels import MaternKernel as MaternKernel
     from .kernels import PolynomialKernel as PolynomialKernel
     from .kernels import RationalQuadraticKernel as RationalQuadraticKernel
-    from .lanes.row_objects import rows as rows
+    from .lanes.per_row.objects import rows as rows
     from .online import ExperienceMemory as ExperienceMemory
     from .online import MixtureRegressor as MixtureRegressor
     from .online import StaFRegressor as StaFRegressor
@@ -81,7 +81,7 @@ else:
             *("AnchoredKernel", "ExponentialKernel", "GaussianKernel", "InverseMultiquadricKernel"),
             *("Kernel", "MaternKernel", "PolynomialKernel", "RationalQuadraticKernel"),
         ),
-        "lanes.row_objects": ("rows",),
+        "lanes.per_row.objects": ("rows",),
         "online": ("ExperienceMemory", "MixtureRegressor", "StaFRegressor"),
         "sweeps.python_api": ("read_runs", "run", "sweep"),  # not for `import *`: they import Hydra
     }

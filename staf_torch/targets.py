@@ -8,7 +8,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from .lanes.row_objects import OfRows
+from .lanes.per_row.objects import OfRows
 from .numerics.checks import fail, number, own_number, vector
 
 __all__ = ["Cosine", "Paper", "Quadratic"]

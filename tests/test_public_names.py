@@ -28,7 +28,7 @@ import staf_torch
 from staf_torch.cli.site import build
 from staf_torch.cli.site.formulas import typeset
 from staf_torch.cli.site.names import public_names
-from staf_torch.lanes import compiler
+from staf_torch.lanes.compilation import compiler
 from staf_torch.sweeps.python_api import Runs, sweep
 
 CONTRACT = """

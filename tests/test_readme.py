@@ -28,7 +28,7 @@ from omegaconf import OmegaConf
 from staf_torch import __version__
 from staf_torch.cli import export, table
 from staf_torch.cli.staf import main as main  # its import registers the launcher of `staf -m`
-from staf_torch.lanes import compiler
+from staf_torch.lanes.compilation import compiler
 
 README = ROOT / "README.md"
 MANUALS = sorted(

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from staf_torch import lanes
-from staf_torch.lanes import cache
+from staf_torch.lanes.compilation import cache
 
 
 @pytest.mark.skipif(sanitized.missing() is not None, reason=sanitized.missing() or "")

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..lanes.row_decisions import in_any_row
-from ..lanes.row_objects import OfRows
+from ..lanes.per_row.decisions import in_any_row
+from ..lanes.per_row.objects import OfRows
 from ..numerics.angles import periods_of, wrap_each
 from ..numerics.checks import fail, non_negative, object_of, one_or_each, positive, trailing, vector
 from ..numerics.derivatives import row_jacobian

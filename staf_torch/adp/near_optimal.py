@@ -10,12 +10,12 @@ import torch
 from ..approximation.basis import StaFBasis
 from ..centers import StateFollowingCenters, cross_polytope
 from ..kernels import ExponentialKernel
-from ..lanes.each_row import spread_rows, tried
 from ..lanes.gradients import without_gradient
-from ..lanes.opaque import opaque
-from ..lanes.row_decisions import at_once, is_of_rows, most_of_rows
-from ..lanes.row_kinds import Kind, kinds_of_rows
-from ..lanes.row_objects import row_of
+from ..lanes.per_row.decisions import at_once, is_of_rows, most_of_rows
+from ..lanes.per_row.each_row import spread_rows, tried
+from ..lanes.per_row.kinds import Kind, kinds_of_rows
+from ..lanes.per_row.objects import row_of
+from ..lanes.torch_compile.opaque import opaque
 from ..numerics.checks import choice, flag, positive_real
 from ..numerics.default_device import beside
 from ..signs import Sign

@@ -10,9 +10,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..lanes.row_decisions import in_any_row, is_of_rows, of_first, rows_of
+from ..lanes.per_row.decisions import in_any_row, is_of_rows, of_first, rows_of
+from ..lanes.per_row.objects import rows
 from ..lanes.row_numbers import all_rows
-from ..lanes.row_objects import rows
 from ..numerics.checks import fail
 from ..systems import Bounds, Linear, Plant
 from ..systems.user_plants import FunctionPlant

@@ -8,8 +8,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
+from ..lanes.per_row.objects import OfRows
 from ..lanes.row_numbers import RowNumbers
-from ..lanes.row_objects import OfRows
 from ..numerics.checks import fail, hold, kept, non_negative, positive, shown, trailing, values_of
 from ..numerics.row_checks import check_radius
 

@@ -18,8 +18,8 @@ from ..centers import StateFollowingCenters, rings
 from ..engine import chase
 from ..kernels import ExponentialKernel
 from ..lanes import Program
-from ..lanes.cache import cache
-from ..lanes.compiler import find_compiler
+from ..lanes.compilation.cache import cache
+from ..lanes.compilation.compiler import find_compiler
 from ..lanes.device.cuda import kernel_compiler
 from ..optim import SteepestDescent
 from ..results.build import installed

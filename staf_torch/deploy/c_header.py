@@ -16,11 +16,11 @@ from torch import Tensor, nn
 
 from ..adp import Controller
 from ..lanes import Program
-from ..lanes.compiler import run
+from ..lanes.compilation.compiler import run
 from ..lanes.emit.c import commented
 from ..lanes.emit.identifiers import checked_names, guarded
-from ..lanes.row_c import RowC, wide
-from ..lanes.row_objects import refuse_rows, row_of
+from ..lanes.emit.row_c import RowC, wide
+from ..lanes.per_row.objects import refuse_rows, row_of
 from ..lanes.trace.step import Step
 from ..lanes.trace.tracer import NotLoweredError
 from ..lanes.tree import Tree, flatten, labels

@@ -9,10 +9,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..lanes.call_inputs import Given
+from ..lanes.calls.inputs import Given
 from ..lanes.emit.schedule import Schedule
-from ..lanes.row_independence import doubt
 from ..lanes.trace.graph import FIXED
+from ..lanes.trace.row_independence import doubt
 from ..lanes.trace.step import Step, Traced, trace
 from ..lanes.trace.tracer import NotLoweredError
 from .data_sheet import Work

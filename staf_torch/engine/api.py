@@ -12,12 +12,12 @@ from torch import Tensor
 
 from ..approximation.basis import StaFBasis, Target
 from ..lanes import Program, Shared
+from ..lanes.choice.short_calls import ShortCall
+from ..lanes.choice.when_compiled import undecided
 from ..lanes.device.chunks import beside_history, joined
-from ..lanes.opaque import one_operator
 from ..lanes.row_numbers import over_rows
-from ..lanes.short_calls import ShortCall
+from ..lanes.torch_compile.opaque import one_operator
 from ..lanes.tree import plain
-from ..lanes.when_compiled import undecided
 from ..optim.base import UpdateLaw
 from ..signs import Sign
 from . import row_program

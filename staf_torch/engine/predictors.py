@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ..approximation.basis import StaFBasis, Target
-from ..lanes.row_objects import OfRows
+from ..lanes.per_row.objects import OfRows
 from ..numerics.checks import choice
 from ..numerics.derivatives import use_forward_mode
 

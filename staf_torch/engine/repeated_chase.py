@@ -11,12 +11,12 @@ from typing import Any
 from torch import Tensor
 
 from ..lanes import Program
-from ..lanes.call import form, ordinary
+from ..lanes.calls.planned_call import form, ordinary
+from ..lanes.choice.when_compiled import worth
+from ..lanes.dependencies.lookups import is_users
 from ..lanes.device.chunks import beside_history
 from ..lanes.device.kernel import DeviceCall
-from ..lanes.lookups import is_users
 from ..lanes.tree import flatten, unflatten
-from ..lanes.when_compiled import worth
 from .problem import Problem
 from .quantities import Numbers
 from .recursion import last_weights, start

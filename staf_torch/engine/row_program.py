@@ -14,9 +14,9 @@ from torch import Tensor, nn
 
 from ..approximation.basis import GramStructure, StaFBasis, Target
 from ..lanes import Program
-from ..lanes.call import say_transformed, served
+from ..lanes.calls.planned_call import say_transformed, served
+from ..lanes.choice.when_compiled import worth
 from ..lanes.shared_programs import SharedPrograms
-from ..lanes.when_compiled import worth
 from ..optim.base import UpdateLaw
 from ..optim.objective import NativeError, Objective, Precomputed
 from .certificate import Certificate, certify, first_link

@@ -19,8 +19,8 @@ from ..adp.loop.controller import Carried, Policy
 from ..adp.loop.step import ClosedLoop, LoopState, points_of_steps
 from ..adp.problem.rules import check_problem
 from ..lanes.gradients import refuse_gradient
+from ..lanes.per_row.objects import counts_of_rows
 from ..lanes.row_numbers import all_rows, over_rows
-from ..lanes.row_objects import counts_of_rows
 from ..numerics.checks import choice, fail, one_or_each, positive, positive_real
 from ..systems import Bounds, ControlAffineSystem, Plant
 

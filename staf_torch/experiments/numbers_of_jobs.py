@@ -9,9 +9,9 @@ from typing import Any, NamedTuple, TypeVar
 
 import torch
 
-from ..lanes.contents import Contents
+from ..lanes.dependencies.contents import Contents
+from ..lanes.per_row.objects import merged
 from ..lanes.row_numbers import some_rows
-from ..lanes.row_objects import merged
 from ..results.files import grouped
 
 _log = logging.getLogger(__name__)

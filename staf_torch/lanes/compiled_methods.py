@@ -22,21 +22,21 @@ from torch import Tensor, nn
 from torch.utils import _device
 
 from ..signs import Sign
-from .call import at_once, ordinary
-from .call import served as served_by
-from .call_inputs import one_precision
-from .contents import BOUND, Contents
-from .graph_operator import NAMED, spelled
-from .locks import Mutex
-from .loops import tracing_now
-from .one_thread import ENTRIES, alone
-from .opaque import one_operator
-from .plain_time import PlainTime
+from .calls.inputs import one_precision
+from .calls.planned_call import at_once, ordinary
+from .calls.planned_call import served as served_by
+from .choice.plain_time import PlainTime
+from .choice.when_compiled import undecided, worth
+from .dependencies.contents import BOUND, Contents
 from .program import Program
 from .row_functions import Rows, Trees, is_state
 from .row_numbers import RowNumbers, over_rows, points_of_rows
+from .threads.locks import Mutex
+from .threads.one_thread import ENTRIES, alone
+from .torch_compile.graph_operator import NAMED, spelled
+from .torch_compile.opaque import one_operator
+from .trace.loops import tracing_now
 from .tree import Shared, Tree, flatten, plain, unflatten
-from .when_compiled import undecided, worth
 
 _PAYS = 100  # calls of a small batch in plain torch after which it is compiled, however short they are
 _SOON = 30  # calls

@@ -20,8 +20,8 @@ from typing import Any, ParamSpec, TypeVar
 import torch
 from torch import Tensor
 
-from .contents import ATOMS, BOUND, IDLE, Derived, Walk
-from .lookups import is_users
+from .dependencies.contents import ATOMS, BOUND, IDLE, Derived, Walk
+from .dependencies.lookups import is_users
 from .tree import flatten, unflatten
 
 _P = ParamSpec("_P")

@@ -9,12 +9,12 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from ..signs import Sign
+from .choice.plain_time import PlainTime, RepaysError
+from .choice.short_calls import ShortCall
 from .compiled_methods import methods_of
-from .plain_time import PlainTime, RepaysError
 from .program import Program
-from .row_independence import generators
 from .row_numbers import one_by_one
-from .short_calls import ShortCall
+from .trace.row_independence import generators
 from .tree import Tree
 
 _log = logging.getLogger(__name__)

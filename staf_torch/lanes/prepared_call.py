@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from .adjoint import GradientCall
-from .call import PlannedCall, Where, form, ordinary, say_transformed, seen, seen_by_others
-from .call_inputs import Given, whole
+from .adjoint.gradient_call import GradientCall
+from .calls.inputs import Given, whole
+from .calls.planned_call import PlannedCall, Where, form, ordinary, say_transformed, seen, seen_by_others
 from .device.kernel import DeviceCall
 from .log import say
-from .opaque import one_operator
+from .torch_compile.opaque import one_operator
 from .tree import Tree, flatten, unflatten
 
 if TYPE_CHECKING:

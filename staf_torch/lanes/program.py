@@ -10,22 +10,22 @@ import torch
 from torch import Tensor
 
 from ..signs import Sign
-from .adjoint_steps import keeping_step
-from .call import Compiled, seen, served
-from .call_inputs import Given, one_precision, whole
-from .compiler import machine_code
-from .contents import Contents, Derived
+from .adjoint.steps import keeping_step
+from .calls.inputs import Given, one_precision, whole
+from .calls.planned_call import Compiled, seen, served
+from .compilation.compiler import machine_code
+from .dependencies.contents import Contents, Derived
 from .emit.cpp import emit
-from .locks import Mutex
+from .emit.row_c import RowC
 from .log import say
-from .loops import few_passes, scan, tracing_now
-from .one_thread import ENTRIES, alone
-from .opaque import one_operator
 from .prepared_call import Prepared
-from .row_c import RowC
-from .row_independence import doubt, undrawn
 from .row_numbers import over_rows, points_of_rows
 from .texts import Built, Form, kernel, known
+from .threads.locks import Mutex
+from .threads.one_thread import ENTRIES, alone
+from .torch_compile.opaque import one_operator
+from .trace.loops import few_passes, scan, tracing_now
+from .trace.row_independence import doubt, undrawn
 from .trace.step import Step, trace
 from .trace.step_copy import NoReverseError
 from .trace.tracer import NotLoweredError

@@ -7,8 +7,8 @@ from typing import Any
 
 from torch import Tensor
 
-from . import call
-from .call import PlannedCall
+from .calls import planned_call as call
+from .calls.planned_call import PlannedCall
 from .prepared_call import Plan
 from .program import Program
 from .shared_programs import shared_program

@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from .contents import Contents
-from .locks import Mutex
-from .loops import traced_as
+from .dependencies.contents import Contents
+from .dependencies.tensor_writes import Writes
+from .dependencies.told_numbers import leads_by_copies, told_copies
 from .program import Program
-from .tensor_writes import Writes
-from .told_numbers import leads_by_copies, told_copies
+from .threads.locks import Mutex
+from .trace.loops import traced_as
 from .trace.step import Step
 
 _log = logging.getLogger(__name__)

@@ -8,13 +8,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from . import cache
-from .adjoint_steps import ReversedStep
-from .cache import Trace
-from .call import Compiled
-from .call_inputs import Given
-from .compiler import REVERSED
-from .contents import Contents
+from . import trace_files
+from .adjoint.steps import ReversedStep
+from .calls.inputs import Given
+from .calls.planned_call import Compiled
+from .compilation.compiler import REVERSED
+from .dependencies.contents import Contents
 from .emit.cpp import emit
 from .emit.cuda import Dtypes, emit_cuda
 from .emit.tables import Text
@@ -22,6 +21,7 @@ from .row_numbers import RowNumbers
 from .trace.kept_carries import carried
 from .trace.step import Step, Traced, trace
 from .trace.tracer import NotLoweredError
+from .trace_files import Trace
 from .tree import plain
 
 Form = int | torch.device
@@ -73,14 +73,14 @@ def known(step: Step, described: tuple[bytes, Sequence[Tensor]] | None, given: G
         form: of the code.
     """
     shapes = None if described is None else Contents(given.key()).signature()
-    if described is None or shapes is None or not cache.unpatched():
+    if described is None or shapes is None or not trace_files.unpatched():
         return written(step, given, form)
     by, tensors = described
-    path = cache.place(by, shapes, form)
-    found = cache.load(path, tensors)
+    path = trace_files.place(by, shapes, form)
+    found = trace_files.load(path, tensors)
     if found is None:
         found = written(step, given, form)
-        cache.save(path, found, tensors)
+        trace_files.save(path, found, tensors)
     return found
 
 

@@ -9,9 +9,9 @@ from torch import Tensor, nn
 
 from ..centers import StateFollowingCenters
 from ..kernels import Kernel, PolynomialKernel
-from ..lanes.loops import untraced
+from ..lanes.per_row.objects import made_by_rows
 from ..lanes.row_numbers import all_rows, resolving
-from ..lanes.row_objects import made_by_rows
+from ..lanes.trace.loops import untraced
 from .base import LocalSpace
 from .elimination import Degrees, degrees_of
 from .graded import SERIES_BELOW, GradedBasis, GradedSpace, graded_basis

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ..centers.layouts import exponents
-from ..lanes.row_objects import rows
+from ..lanes.per_row.objects import rows
 
 _SINGULAR = 1e-12  # of the monomials' Fischer norm 1: below this a direction belongs to a higher degree
 

@@ -13,10 +13,10 @@ from torch import Tensor
 from ..approximation.basis import StaFBasis, Target
 from ..centers import probe_points
 from ..lanes import Program, reduce, shared_program
-from ..lanes.plain_time import PlainTime
+from ..lanes.choice.plain_time import PlainTime
+from ..lanes.choice.when_compiled import undecided, worth
+from ..lanes.per_row.objects import made_by_rows
 from ..lanes.row_numbers import RowNumbers, over_rows, points_of_rows, some_rows
-from ..lanes.row_objects import made_by_rows
-from ..lanes.when_compiled import undecided, worth
 from ..local_basis import NewtonSpace, evaluate_scaled, scale
 from ..numerics.linalg import condition_number
 

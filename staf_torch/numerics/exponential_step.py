@@ -19,7 +19,7 @@ from torch import Tensor, bmm
 from torch.nn.functional import pad
 
 from ..lanes import scan
-from ..lanes.row_decisions import in_any_row, is_of_rows
+from ..lanes.per_row.decisions import in_any_row, is_of_rows
 from .default_device import designed_on_cpu
 from .linalg import exponential
 from .rows import known_quantile

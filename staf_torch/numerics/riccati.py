@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, bmm
 
 from ..lanes import repeat
-from ..lanes.row_decisions import in_any_row, is_of_rows
+from ..lanes.per_row.decisions import in_any_row, is_of_rows
 from .checks import integer
 
 _DOUBLINGS, _NEWTON = 60, 8  # at most

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..lanes.each_row import each_row
+from ..lanes.per_row.each_row import each_row
 from . import show
 from .checks import fail
 

@@ -12,8 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..lanes.compiler import compiled
-from ..lanes.when_compiled import runs_kernels, worth
+from ..lanes.choice.when_compiled import runs_kernels, worth
+from ..lanes.compilation.compiler import compiled
 from .filter_program import KernelFilter
 from .kalman_filter import LocalFilter
 from .local_functions import LocalFunctions, OwnFunctions

@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from ..kernels import Kernel
-from ..lanes.call import seen_by_others
-from ..lanes.locks import ReadWriteLock
-from ..lanes.opaque import opaque
+from ..lanes.calls.planned_call import seen_by_others
+from ..lanes.threads.locks import ReadWriteLock
+from ..lanes.torch_compile.opaque import opaque
 from ..numerics.checks import fail, integer, trailing
 from ..numerics.default_device import beside, on
 from ..signs import Sign

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..lanes import repeat
-from ..lanes.row_objects import OfRows
+from ..lanes.per_row.objects import OfRows
 from .objective import Objective
 
 LawState = tuple[Tensor, ...]

@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from ..experiments.registry import Metrics
 from ..figures.style import FigurePaper, in_a_sweep, printed_on
-from ..lanes.compiler import compiler
+from ..lanes.compilation.compiler import compiler
 from ..numerics.checks import COMMAND_LINE, choice
 from ..results import run_record as records
 from ..results.files import FIGURES, METRICS

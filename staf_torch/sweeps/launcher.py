@@ -14,7 +14,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from ..lanes.compiler import compiler
+from ..lanes.compilation.compiler import compiler
 from ..numerics.checks import choice, integer
 from ..results import run_record as records
 from ..results.files import METRICS, ROWS, RUN, partial_name

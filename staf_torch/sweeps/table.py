@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 from .. import __version__
 from ..experiments.registry import check_animation
-from ..lanes.compiler import compiler
+from ..lanes.compilation.compiler import compiler
 from ..results import run_record as records
 from ..results.build import checksums, damage, modules
 from ..results.files import ROWS, is_free, open_after, partial_name

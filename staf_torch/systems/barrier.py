@@ -9,7 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from ..lanes.row_objects import by_rows
+from ..lanes.per_row.objects import by_rows
 from ..numerics.angles import wrap
 from ..numerics.checks import fail, fails, hold, numbers_of, states
 from .base import ControlAffineSystem, Linearisation, Units

@@ -12,9 +12,9 @@ import torch
 from torch import Tensor, nn
 
 from ..lanes.gradients import refuse_gradient
-from ..lanes.row_decisions import in_any_row
+from ..lanes.per_row.decisions import in_any_row
+from ..lanes.per_row.objects import OfRows, by_rows
 from ..lanes.row_numbers import RowNumbers, all_rows, value_of
-from ..lanes.row_objects import OfRows, by_rows
 from ..numerics.angles import wrap
 from ..numerics.checks import check_shared, fail, trailing
 from ..numerics.default_device import device_of

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from ..lanes.gradients import refuse_gradient
-from ..lanes.row_decisions import in_any_row
-from ..lanes.row_objects import by_rows
+from ..lanes.per_row.decisions import in_any_row
+from ..lanes.per_row.objects import by_rows
 from ..numerics.checks import number, object_of
 from ..numerics.derivatives import central_slopes
 from ..signs import Sign

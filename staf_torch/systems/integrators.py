@@ -11,17 +11,17 @@ import torch
 from torch import Tensor
 
 from ..lanes import Program, repeat
+from ..lanes.choice.plain_time import DIFFERENTIATED
+from ..lanes.choice.when_compiled import undecided, worth
 from ..lanes.device.chunks import rows_of, with_rows
 from ..lanes.device.host import capturing
 from ..lanes.gradients import wants_gradient
 from ..lanes.loop_program import LoopProgram
-from ..lanes.opaque import one_operator
-from ..lanes.plain_time import DIFFERENTIATED
 from ..lanes.row_numbers import over_rows, over_some_rows, some_rows
 from ..lanes.shared_programs import SharedPrograms
+from ..lanes.torch_compile.opaque import one_operator
 from ..lanes.trace.step import Step
 from ..lanes.tree import Tree
-from ..lanes.when_compiled import undecided, worth
 from ..numerics.checks import fail, integer, positive_real, trailing
 from ..numerics.default_device import beside
 from ..numerics.exponential_step import BENT, GRACE, MOST, TOLERANCE, TRIED, needed_steps

@@ -10,7 +10,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from ..lanes.row_objects import by_rows
+from ..lanes.per_row.objects import by_rows
 from ..numerics.checks import fail, integer, numbers_of, positive_real, vector
 from ..numerics.default_device import beside
 from .base import Bounds, Limit, Linearisation, Plant

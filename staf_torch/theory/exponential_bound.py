@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..centers.layouts import monomials
-from ..lanes.row_objects import refuse_rows
+from ..lanes.per_row.objects import refuse_rows
 from ..numerics.checks import fail, integer, positive_real, sampled, trailing
 from ..signs import Sign
 from .uniform_approximation import ball_grid, near_best, supremum

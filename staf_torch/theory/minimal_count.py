@@ -15,7 +15,7 @@ from torch import Tensor
 from ..approximation.basis import StaFBasis
 from ..centers import StateFollowingCenters, ball, polygon, rings
 from ..kernels import Kernel
-from ..lanes.row_objects import refuse_rows
+from ..lanes.per_row.objects import refuse_rows
 from ..local_basis import GradedBasis, GradedSpace, LocalSpace, newton_space, phi
 from ..numerics.checks import fail, positive_real, trailing
 from ..signs import Sign

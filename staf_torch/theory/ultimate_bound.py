@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ..approximation.basis import StaFBasis, Target
 from ..engine import along, gram_rates
-from ..lanes.row_objects import refuse_rows
+from ..lanes.per_row.objects import refuse_rows
 from ..numerics.checks import fail, integer, positive_real, trailing
 from ..numerics.linalg import condition_number
 from ..optim import SteepestDescent, UpdateLaw

@@ -17,7 +17,7 @@ from variants import LEARNABLE_KERNELS, SMOOTH_KERNELS, by_turns, learned, over
 from variants import RADII as FIXED_RADII
 
 import staf_torch as st
-from staf_torch.lanes.contents import Contents
+from staf_torch.lanes.dependencies.contents import Contents
 from staf_torch.targets import Paper
 
 BATCHES = ((), (4,), (2, 3))

@@ -20,8 +20,8 @@ import torch
 from torch import Tensor
 
 from staf_torch import lanes
-from staf_torch.lanes import cache as folder_of
-from staf_torch.lanes import compiler
+from staf_torch.lanes.compilation import cache as folder_of
+from staf_torch.lanes.compilation import compiler
 
 pytestmark = [
     pytest.mark.needs_compiler,

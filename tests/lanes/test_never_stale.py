@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from staf_torch import lanes
 from staf_torch.lanes import compiled, ready
 from staf_torch.lanes.compiled_methods import CompiledMethod
-from staf_torch.lanes.contents import Contents
+from staf_torch.lanes.dependencies.contents import Contents
 from staf_torch.lanes.program import Program
 from staf_torch.lanes.shared_programs import SharedPrograms
 from staf_torch.systems import simulate

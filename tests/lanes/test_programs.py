@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from staf_torch import lanes, systems
 from staf_torch.lanes import Shared
-from staf_torch.lanes.call import LARGE, fresh
+from staf_torch.lanes.calls.planned_call import LARGE, fresh
 
 pytestmark = pytest.mark.needs_compiler
 

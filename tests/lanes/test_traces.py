@@ -20,9 +20,9 @@ from torch import Tensor, nn
 from variants import KERNELS
 
 from staf_torch import StaFBasis, StateFollowingCenters, chase, kernels, lanes, optim, rings, targets
-from staf_torch.lanes.cache import unpatched
 from staf_torch.lanes.program import Program, Step
 from staf_torch.lanes.shared_programs import SharedPrograms
+from staf_torch.lanes.trace_files import unpatched
 
 pytestmark = pytest.mark.needs_compiler
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ...lanes.row_objects import OfRows
+from ...lanes.per_row.objects import OfRows
 from ...numerics.checks import non_negative, one_or_each, positive
 from ...numerics.derivatives import row_jacobian
 from ...numerics.riccati import product

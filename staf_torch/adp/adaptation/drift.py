@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from ...kernels import Kernel
+from ...lanes.per_row.objects import OfRows
 from ...lanes.row_numbers import nonzero
-from ...lanes.row_objects import OfRows
 from ...numerics.checks import fail, non_negative, positive_real, real, trailing
 from ...numerics.default_device import device_of
 from ...numerics.derivatives import row_jacobian

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ...lanes import repeat
-from ...lanes.row_objects import OfRows
+from ...lanes.per_row.objects import OfRows
 from ...numerics.checks import integer, non_negative, positive_real, real
 from ..problem.cost import matvec
 from .windows import Equation

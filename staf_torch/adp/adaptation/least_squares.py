@@ -8,8 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ...lanes.per_row.objects import OfRows
 from ...lanes.row_numbers import nonzero
-from ...lanes.row_objects import OfRows
 from ...numerics.checks import non_negative, one_or_each, positive, positive_real, real, vector
 from ...numerics.riccati import measured
 from .windows import Equation

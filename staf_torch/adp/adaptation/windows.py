@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ...lanes.row_objects import OfRows
+from ...lanes.per_row.objects import OfRows
 from ...numerics.checks import choice, fail, non_negative, positive_real, real
 from .parametric import ParametricPlant
 

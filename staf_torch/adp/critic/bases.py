@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from ...approximation.basis import StaFBasis
 from ...centers import StateRadius
 from ...kernels import AnchoredKernel, ExponentialKernel
-from ...lanes.row_objects import OfRows
+from ...lanes.per_row.objects import OfRows
 from ...numerics.checks import choice, flag, integer, positive_real
 from ...numerics.default_device import device_of
 from ...numerics.derivatives import jacobian

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from ...centers import ConstantRadius, Radius
-from ...lanes.row_objects import OfRows
+from ...lanes.per_row.objects import OfRows
 from ...numerics.checks import choice, integer, positive
 
 

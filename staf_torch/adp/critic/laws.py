@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ...lanes import traced_as
-from ...lanes.row_objects import OfRows
+from ...lanes.per_row.objects import OfRows
 from ...lanes.trace import factorisations
 from ...numerics.checks import fail, non_negative, positive_real
 from ..problem.cost import matvec

@@ -10,13 +10,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
+from ...lanes.dependencies.lookups import is_users
+from ...lanes.dependencies.tensor_writes import version
 from ...lanes.gradients import gradients_of, marked
-from ...lanes.lookups import is_users
-from ...lanes.loops import where_rows
-from ...lanes.one_thread import small
+from ...lanes.per_row.objects import OfRows
 from ...lanes.row_numbers import over_rows
-from ...lanes.row_objects import OfRows
-from ...lanes.tensor_writes import version
+from ...lanes.threads.one_thread import small
+from ...lanes.trace.loops import where_rows
 from ...numerics.checks import fail, real, trailing
 from ...numerics.default_device import beside
 from ...numerics.linalg import riccati

@@ -18,11 +18,11 @@ from torch import Tensor
 
 from ...approximation.basis import StaFBasis
 from ...lanes import Program
-from ...lanes.call import served
-from ...lanes.contents import Contents
-from ...lanes.each_row import each_row
+from ...lanes.calls.planned_call import served
+from ...lanes.dependencies.contents import Contents
 from ...lanes.gradients import wants_gradient
-from ...lanes.row_decisions import decided
+from ...lanes.per_row.decisions import decided
+from ...lanes.per_row.each_row import each_row
 from ...lanes.row_numbers import anybodys, over_rows
 from ...numerics.checks import fail, positive_real, trailing
 from ...numerics.default_device import without_numbers

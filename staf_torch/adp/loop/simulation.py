@@ -11,15 +11,15 @@ import torch
 from torch import Tensor
 
 from ...lanes import Program
+from ...lanes.choice.plain_time import DIFFERENTIATED
+from ...lanes.choice.when_compiled import undecided, worth
 from ...lanes.device.chunks import beside_history, joined, rows_of, with_rows
 from ...lanes.gradients import wants_gradient
 from ...lanes.loop_program import LoopProgram
-from ...lanes.opaque import opaque
-from ...lanes.philox import seed_parts
-from ...lanes.plain_time import DIFFERENTIATED
 from ...lanes.row_numbers import over_rows, some_rows
+from ...lanes.torch_compile.opaque import opaque
+from ...lanes.trace.philox import seed_parts
 from ...lanes.tree import flatten, unflatten
-from ...lanes.when_compiled import undecided, worth
 from ...numerics.angles import wrap
 from ...numerics.checks import choice, copied, fail, integer
 from ...numerics.default_device import beside

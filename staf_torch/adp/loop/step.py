@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from ...lanes import Program, shared_program
-from ...lanes.philox import seed_parts, uniform
 from ...lanes.row_numbers import nonzero
+from ...lanes.trace.philox import seed_parts, uniform
 from ...lanes.tree import flatten, unflatten
 from ...numerics.angles import wrap
 from ...numerics.checks import choice, fail, flag, positive_real
@@ -178,7 +178,7 @@ def program(loop: ClosedLoop, compile: bool) -> Program:
     """Return ``loop`` over many steps, compiled where that is possible and asked for: it records the state
     before every step, and the control.
 
-    Compiled loops that differ in numbers alone share one text: `lanes.told_numbers`.
+    Compiled loops that differ in numbers alone share one text: `lanes.dependencies.told_numbers`.
     """
     make = functools.partial(functools.partial, recorded)
     if not compile:

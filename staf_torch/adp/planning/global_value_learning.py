@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from ...lanes.gradients import without_gradient
-from ...lanes.opaque import opaque
-from ...lanes.row_decisions import numbers_of_rows
+from ...lanes.per_row.decisions import numbers_of_rows
+from ...lanes.per_row.objects import refuse_rows
 from ...lanes.row_numbers import some_rows
-from ...lanes.row_objects import refuse_rows
+from ...lanes.torch_compile.opaque import opaque
 from ...numerics.checks import fail, integer, real
 from ...signs import Sign
 from ...systems import Plant

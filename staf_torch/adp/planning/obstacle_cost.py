@@ -10,8 +10,8 @@ from typing import ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
+from ...lanes.per_row.objects import made_by_rows
 from ...lanes.row_numbers import all_rows, over_rows, points_of_rows
-from ...lanes.row_objects import made_by_rows
 from ...numerics.checks import choice, fail, integer, object_of, positive_real
 from ...numerics.linalg import Matrix
 from ...numerics.row_checks import check_rows

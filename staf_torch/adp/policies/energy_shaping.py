@@ -8,7 +8,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from ...lanes.row_objects import OfRows
+from ...lanes.per_row.objects import OfRows
 from ...numerics.checks import fail, positive_real, trailing
 from ...systems import ControlAffineSystem
 from ..loop.controller import LQR

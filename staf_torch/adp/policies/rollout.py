@@ -14,14 +14,14 @@ from ...approximation.basis import StaFBasis
 from ...centers import Radius, StateFollowingCenters, ball, cross_polytope, rings
 from ...kernels import ExponentialKernel, GaussianKernel, Kernel
 from ...lanes import call, compiled, each, repeat
-from ...lanes.call import PlannedCall
-from ...lanes.contents import Contents
-from ...lanes.each_row import each_row
-from ...lanes.one_thread import small
+from ...lanes.calls.planned_call import PlannedCall
+from ...lanes.dependencies.contents import Contents
+from ...lanes.per_row.each_row import each_row
+from ...lanes.per_row.objects import Rowwise
 from ...lanes.prepared_call import Plan
 from ...lanes.row_functions import Rows, check_states
 from ...lanes.row_numbers import RowNumbers, points_of_rows
-from ...lanes.row_objects import Rowwise
+from ...lanes.threads.one_thread import small
 from ...numerics.checks import fail, integer, object_of, positive_real, trailing
 from ...numerics.default_device import beside, device_of
 from ...numerics.exponential_step import stalls

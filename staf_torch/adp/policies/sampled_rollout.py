@@ -14,8 +14,8 @@ from torch import Tensor
 from ...approximation.basis import StaFBasis
 from ...lanes import compiled, each, repeat, scan
 from ...lanes.gradients import defer_gradient, marked
-from ...lanes.loops import repeat_counted
-from ...lanes.row_objects import Rowwise
+from ...lanes.per_row.objects import Rowwise
+from ...lanes.trace.loops import repeat_counted
 from ...numerics.box import LARGEST, box_minimum
 from ...numerics.checks import fail, integer, positive_real, trailing
 from ...numerics.default_device import KeptPrecision, beside, device_of

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ...lanes.row_decisions import in_any_row
+from ...lanes.per_row.decisions import in_any_row
 from ...numerics.checks import fail, one_or_each, positive
 from ...numerics.linalg import Matrix
 from ...systems.base import Limit

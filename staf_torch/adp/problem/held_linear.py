@@ -13,9 +13,9 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from ...lanes.gradients import without_gradient
-from ...lanes.one_thread import small
+from ...lanes.per_row.objects import made_by_rows
 from ...lanes.row_numbers import nonzero
-from ...lanes.row_objects import made_by_rows
+from ...lanes.threads.one_thread import small
 from ...numerics.checks import fail, object_of, positive_real
 from ...numerics.default_device import designed_on_cpu
 from ...numerics.derivatives import STEP, central_slopes

@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from ...lanes import repeat
-from ...lanes.each_row import each_row, met_rows
-from ...lanes.loops import untraced
-from ...lanes.row_decisions import is_of_rows
+from ...lanes.per_row.decisions import is_of_rows
+from ...lanes.per_row.each_row import each_row, met_rows
+from ...lanes.per_row.objects import made_by_rows
 from ...lanes.row_numbers import nonzero
-from ...lanes.row_objects import made_by_rows
+from ...lanes.trace.loops import untraced
 from ...numerics.checks import integer, positive_real
 from ...numerics.default_device import device_of, without_numbers
 from ...numerics.exponential_step import (

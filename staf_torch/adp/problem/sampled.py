@@ -13,10 +13,10 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from ...lanes import each, traced_as
-from ...lanes.each_row import first_row
 from ...lanes.gradients import without_gradient
-from ...lanes.row_decisions import in_any_row
-from ...lanes.row_objects import Note, OfRows
+from ...lanes.per_row.decisions import in_any_row
+from ...lanes.per_row.each_row import first_row
+from ...lanes.per_row.objects import Note, OfRows
 from ...numerics.angles import turned, unwrapped, wrap
 from ...numerics.checks import fail, integer, trailing
 from ...numerics.default_device import beside, device_of

@@ -8,7 +8,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from ...lanes.row_objects import by_rows
+from ...lanes.per_row.objects import by_rows
 from ...numerics.angles import wrap
 from ...numerics.checks import copied, fail
 from ...numerics.linalg import Matrix

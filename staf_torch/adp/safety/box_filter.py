@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from ...lanes import compiled, repeat
-from ...lanes.row_objects import OfRows
+from ...lanes.per_row.objects import OfRows
 from ...numerics.checks import fail, positive_real, trailing
 from ...numerics.default_device import device_of
 from ...numerics.runge_kutta import runge_kutta_mean, runge_kutta_stages

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ...lanes.row_decisions import agreed, in_any_row
+from ...lanes.per_row.decisions import agreed, in_any_row
 from ...numerics.checks import fail, non_negative, one_or_each, positive, trailing
 from ...numerics.default_device import device_of
 from ...numerics.linalg import shortest_solution

@@ -22,9 +22,9 @@ from typing import Any, NamedTuple
 import torch
 
 from ...signs import Sign
-from ..cache import cache, found, publish, scratch, used
+from ..compilation.cache import cache, found, publish, scratch, used
 from ..emit.cuda import FEWER_REGISTERS, KERNEL
-from ..locks import Mutex
+from ..threads.locks import Mutex
 
 _log = logging.getLogger(__name__)
 REMEDY = "install torch with CUDA, or `pip install staf-torch[cuda]`"

@@ -16,9 +16,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .. import call
-from ..compiler import library
-from ..locks import Mutex
+from ..calls import planned_call as call
+from ..compilation.compiler import library
+from ..threads.locks import Mutex
 
 _FOLDER = Path(__file__).parent
 _OPTIONS = ("-O1", "-march=native", "-std=c++17", "-shared", "-fPIC", "-w", "-ffp-contract=off")

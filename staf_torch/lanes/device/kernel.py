@@ -11,10 +11,10 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from ..call import Compiled, entries_lie_evenly, inner_strides
+from ..calls.planned_call import Compiled, entries_lie_evenly, inner_strides
 from ..emit.cuda import in_arguments
-from ..locks import Mutex
 from ..row_numbers import columns
+from ..threads.locks import Mutex
 from ..tree import Shared, plain
 from .chunks import Room, in_chunks
 from .cuda import CudaDevice

@@ -7,10 +7,10 @@ import math
 from collections.abc import Sequence
 from typing import ClassVar, NamedTuple
 
-from ..trace.graph import FIXED, FLAG, NARROW, REAL, ROW, STEP, WHOLE, WIDE, Graph
+from ..trace.graph import FIXED, FLAG, NARROW, REAL, ROW, STEP, WHOLE, WIDE, Graph, Sizes
 from .eliminations import EliminationWriter
 from .identifiers import checked_names, guarded
-from .schedule import Schedule, Sizes
+from .schedule import Schedule
 
 _NAMES = {"abs": "fabs", "round": "rint"}
 

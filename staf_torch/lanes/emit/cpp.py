@@ -14,8 +14,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
 from typing import ClassVar
 
-from ..trace.graph import FIXED, FLAG, IN_PLACE, NARROW, NOW, REAL, ROW, STEP, WHOLE, Graph
-from .schedule import Schedule, Sizes, evenly
+from ..trace.graph import FIXED, FLAG, IN_PLACE, NARROW, NOW, REAL, ROW, STEP, WHOLE, Graph, Sizes
+from .schedule import Schedule, evenly
 from .tables import TableWriter, Text
 
 _FEW = 400  # nodes of a program of which two vectors fit the registers and caches side by side

@@ -14,11 +14,11 @@ from typing import NamedTuple
 
 import torch
 
-from ..trace.graph import FLAG, NARROW, REAL, ROW, STEP, WHOLE, WIDE, Graph
+from ..trace.graph import FLAG, NARROW, REAL, ROW, STEP, WHOLE, WIDE, Graph, Sizes
 from ..trace.tracer import LARGE, NotLoweredError
 from .c import Names, ScalarWriter, random_numbers
 from .rooms import in_rooms
-from .schedule import Schedule, Sizes, made_again
+from .schedule import Schedule, made_again
 from .tables import TableWriter, Text
 
 KERNEL = "lanes_kernel"

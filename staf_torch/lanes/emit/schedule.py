@@ -11,20 +11,11 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from ..trace.graph import FIXED, IN_PLACE, NOW, REAL, ROW, STEP, Graph
-
-
-class Sizes(NamedTuple):
-    """Numbers of entries that a program reads and writes."""
-
-    rows: Sequence[int]  # of every input that a row has once
-    nows: Sequence[int]  # of every input of a time
-    carries: Sequence[int]
-    outputs: Sequence[int]
 
 
 class Schedule:

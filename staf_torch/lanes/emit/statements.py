@@ -10,9 +10,9 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from ..trace.graph import EXACT, FIXED, IN_PLACE, NARROW, Graph
+from ..trace.graph import EXACT, FIXED, IN_PLACE, NARROW, Graph, Sizes
 from ..trace.tracer import NotLoweredError
-from .schedule import Schedule, Sizes, evenly, leaves
+from .schedule import Schedule, evenly, leaves
 
 _SHORTEST = 4  # entries that are worth a loop
 

@@ -9,10 +9,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..trace.graph import Graph
+from ..trace.graph import Graph, Sizes
 from ..trace.tracer import LARGE
 from .eliminations import EliminationWriter
-from .schedule import Schedule, Sizes, ends_with, taken_over
+from .schedule import Schedule, ends_with, taken_over
 
 
 class Text(NamedTuple):

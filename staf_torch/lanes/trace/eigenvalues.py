@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import _disable_current_modes
 
-from ..loops import repeat, tracer_of
 from .factorisations import in_memory
 from .graph import NARROW, REAL
+from .loops import repeat, tracer_of
 
 
 def eigen(gram: Tensor, UPLO: str = "L", compute_v: bool = True) -> tuple[Tensor, Tensor]:

@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import _disable_current_modes
 
-from ..loops import repeat, tracer_of
 from .graph import REAL, WIDE
+from .loops import repeat, tracer_of
 from .tracer import LARGE, Tracer
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Hashable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -32,6 +32,15 @@ FIXED = ("const", "param")
 ROW, NOW, STEP = 0, 1, 2
 """Depths: what a row has once, what a time brings whatever the carry is, what depends on the carry.
 Loops inside a step are deeper."""
+
+
+class Sizes(NamedTuple):
+    """Numbers of entries that a program reads and writes."""
+
+    rows: Sequence[int]  # of every input that a row has once
+    nows: Sequence[int]  # of every input of a time
+    carries: Sequence[int]
+    outputs: Sequence[int]
 
 
 @dataclasses.dataclass

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..loops import scan
 from .graph import WHOLE, Ids
+from .loops import scan
 from .tracer import LARGE, NotLoweredError, Tracer
 
 _MOVEMENTS = """cat stack index index_select gather flip roll repeat select_scatter slice_scatter index_put

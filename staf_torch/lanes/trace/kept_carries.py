@@ -5,8 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 
-from ..emit.schedule import Sizes
-from .graph import Graph
+from .graph import Graph, Sizes
 
 SAME, BEFORE, AFTER, NOWHERE = "same", "before", "after", "nowhere"
 """Where the numbers of a leaf before a step are: in the first carry, in an output of that time, in an output

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..loops import repeat, scan
+from .loops import repeat, scan
 
 _TERMS = 14  # of the Taylor series; the rest is 2e-17 for a matrix of norm 1/2
 _HALVINGS = 64  # at most: beyond a norm of 1e19 nothing is left of it

@@ -16,9 +16,7 @@ import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-from ..call_inputs import Given
-from ..emit.schedule import Sizes
-from ..loops import tracing
+from ..calls.inputs import Given
 from ..row_numbers import RowNumbers, made_of_list, resolving
 from ..tree import Shared, Tree, flatten, plain
 from . import eigenvalues, factorisations
@@ -26,8 +24,9 @@ from . import reductions as reductions  # its rules
 from .captured_tensors import Recipe, tensors
 from .decompositions import REPLACEMENTS, of_torch
 from .entrywise import RULES
-from .graph import NOW, STEP, Graph
+from .graph import NOW, STEP, Graph, Sizes
 from .indexing import CHOICES, MOVEMENTS, added_at, many, moved
+from .loops import tracing
 from .matrix_exponential import matrix_exponential
 from .tracer import NotLoweredError, Tracer
 

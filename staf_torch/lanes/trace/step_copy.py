@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from ..emit.schedule import Sizes
-from .graph import NOW, REAL, ROW, STEP, Graph, Loop
+from .graph import NOW, REAL, ROW, STEP, Graph, Loop, Sizes
 from .tracer import NotLoweredError
 
 _MOST = 40_000  # nodes of a program whose loops are written out

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ...centers import simplex
 from ...kernels import GaussianKernel
-from ...lanes.compiler import compiled
+from ...lanes.compilation.compiler import compiled
 from ...numerics.checks import flag, integer, positive_real, trailing
 from ..compiled_filter import NATIVE, FunctionPointers
 from ..estimator import StreamEstimator

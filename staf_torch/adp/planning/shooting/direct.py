@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from ....lanes.gradients import without_gradient
-from ....lanes.opaque import opaque
+from ....lanes.per_row.objects import made_by_rows
 from ....lanes.row_numbers import over_rows, points_of_rows, some_rows
-from ....lanes.row_objects import made_by_rows
+from ....lanes.torch_compile.opaque import opaque
 from ....numerics.checks import fail, integer, positive_real, trailing
 from ....numerics.default_device import beside, on_cpu
 from ....numerics.linalg import Matrix

@@ -8,9 +8,9 @@ import math
 import torch
 from torch import Tensor
 
-from ....lanes.row_decisions import decided, numbers_of_rows
+from ....lanes.per_row.decisions import decided, numbers_of_rows
+from ....lanes.per_row.objects import made_by_rows
 from ....lanes.row_numbers import over_rows
-from ....lanes.row_objects import made_by_rows
 from ....numerics.checks import fail, integer, positive_real
 from ....numerics.linalg import Matrix, positive_semidefinite, square
 from ....systems import Plant

@@ -1,0 +1,125 @@
+"""The carry before every time, that a gradient needs: where results have it, it is read there.
+
+The states of a trajectory and the weights of a chase are results and carry at once. What no result has is
+written beside them. Results may be written over before the backward pass, which then computes it again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..calls.planned_call import Compiled, fresh, inner_strides
+from ..trace.kept_carries import AFTER, NOWHERE, SAME
+from ..trace_files import Trace
+from .row_sums import empty_rows
+
+Watched = tuple[Tensor, int]
+
+
+def in_results(trace: Trace, results: int) -> frozenset[int]:
+    """Return the leaves of the carry that never change, or that so many results have at all times."""
+    pairs = enumerate(trace.carried)
+    return frozenset(k for k, (where, j) in pairs if where == SAME or (where != NOWHERE and j < results))
+
+
+class Rooms(NamedTuple):
+    """Tensors of a forward pass, of the dtype of its program.
+
+    Args:
+        all: that are written to; without memory where a carry is not wanted.
+        results: those that are returned: the carry after the last time, and the results.
+        before: the carry before every time, once they are written; of no meaning for leaves not kept.
+        watched: results that are part of it, without their memory, with the writes that torch has counted.
+    """
+
+    all: list[Tensor]
+    results: list[Tensor]
+    before: list[Tensor]
+    watched: list[Watched]
+
+
+class Keeping:
+    """What makes the tensors of calls that keep the carry, on the processor.
+
+    Args:
+        compiled: the program: its outputs are the results, or these and the carry before a step.
+        trace: of the program of the latter kind.
+        keeps: leaves of the carry that are wanted.
+        results: how many there are.
+        sizes: rows and times.
+    """
+
+    def __init__(
+        self, compiled: Compiled, trace: Trace, keeps: frozenset[int], results: int, sizes: tuple[int, int]
+    ) -> None:
+        rows, times = sizes
+        self._like, self._rows, self._times = torch.empty(0, dtype=compiled.real, device="cpu"), rows, times
+        self._ends = [((rows, *shape), (1, *inner_strides(shape, rows))) for shape, _ in compiled.carry]
+        places = [where if k in keeps else (NOWHERE, 0) for k, where in enumerate(trace.carried)]
+        late = {j for where, j in places if where == AFTER}
+        self._read = sorted({j for where, j in places if where not in (SAME, NOWHERE)})
+        self._late = [k for k, (where, _) in enumerate(places) if where == AFTER]
+        self._same = [k for k, (where, _) in enumerate(places) if where == SAME]
+        self._made = dict[
+            int, tuple[int, int, Sequence[int], Sequence[int]]
+        ]()  # numbers, offset, shape, strides
+        self._unwanted = dict[int, Tensor]()
+        for j, (shape, _) in enumerate(compiled.outputs):
+            size = shape.numel() * rows
+            strides = 1, size, *inner_strides(shape, rows)
+            if j < results or j in self._read:
+                more = size * (j in late)
+                self._made[j] = size * times + more, more, (rows, times, *shape), strides
+            else:
+                self._unwanted[j] = self._like.new_empty((0, times, *shape))
+        self._results = len(compiled.carry) + results
+        self._before = list[tuple[int, Sequence[int], Sequence[int]] | Tensor]()
+        for (shape, _), (where, j) in zip(compiled.carry, places, strict=True):
+            if where in (SAME, NOWHERE):
+                self._before.append(self._like.new_zeros(()).expand(rows, times, *shape))
+            else:
+                strides = 1, shape.numel() * rows, *inner_strides(shape, rows)
+                self._before.append((j, (rows, times, *shape), strides))
+
+    def __call__(self, carry: Sequence[Tensor]) -> Rooms:
+        """Return new tensors for a call.
+
+        Args:
+            carry: before the first time.
+        """
+        like, memory, made = self._like, dict[int, Tensor](), dict[int, Tensor]()
+        for j, (size, *form) in self._made.items():
+            memory[j] = fresh(like, size)
+            # No view of another tensor: torch would not let users write to it.
+            made[j] = like.new_empty(0).set_(memory[j].untyped_storage(), *form)
+        before = [
+            form if isinstance(form, Tensor) else memory[form[0]].as_strided(*form[1:])
+            for form in self._before
+        ]
+        for k in self._late:
+            before[k][:, 0] = carry[k]
+        for k in self._same:
+            first = empty_rows(like, self._rows, (), carry[k].shape[1:]).copy_(carry[k])
+            before[k] = first.unsqueeze(1).expand(before[k].shape)
+        ends = [like.new_empty_strided(*form) for form in self._ends]
+        outputs = made | self._unwanted
+        rooms = [*ends, *(outputs[j] for j in range(len(outputs)))]
+        results = rooms[: self._results]
+        watched = [_watched(made[j]) for j in self._read if j < self._results - len(ends)]
+        return Rooms(rooms, results, before, watched)
+
+
+def unchanged(watched: Sequence[Watched]) -> bool:
+    """Return whether nobody has written over results since."""
+    return all(tensor._version == version for tensor, version in watched)
+
+
+def _watched(result: Tensor) -> Watched:
+    """Return an empty tensor that shares the count of writes to a result, and that count."""
+    same = result.detach()
+    same.data = result.new_empty(0)
+    return same, same._version

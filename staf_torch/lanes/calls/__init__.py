@@ -1,0 +1,1 @@
+"""Calls of compiled code: inputs, checked, and what is prepared for those of one form."""

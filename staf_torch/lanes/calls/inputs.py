@@ -1,0 +1,151 @@
+"""Inputs of a program's call: lists of tensors, checked, and the structures of their trees."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Hashable, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..tree import Shared, Tree, flatten, labels, plain, unflatten
+from .planned_call import Where, ordinary
+
+
+class one_precision:  # noqa: N801
+    """Context of a function that may read a network or tensor of another precision than its inputs.
+
+    Args:
+        name: of what was called, for the error.
+        inputs: trees of tensors.
+
+    Raises:
+        ValueError: in place of torch's error on two dtypes.
+    """
+
+    def __init__(self, name: str, *inputs: Tree) -> None:
+        self._name, self._inputs = name, inputs
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: Any, error: BaseException | None, _: object) -> None:
+        if kind is None or kind is not RuntimeError or not re.search("same dtype|scalar type", str(error)):
+            return
+        floats = [x.dtype for x in map(plain, flatten(self._inputs)[0]) if x.is_floating_point()]
+        real = floats[0] if floats else "of no precision"
+        raise ValueError(
+            f"{self._name}: its inputs are {real}, and a network or tensor that it reads is not: write "
+            f"`net.to({real})`, or `net(x.float())` for 7 digits; torch's error: {str(error).strip()}"
+        ) from error
+
+
+def whole(name: str, value: object, least: int) -> int:
+    """Return an argument of a program's call that must be an integer."""
+    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+        raise ValueError(f"`Program({name}=...)` must be an integer, at least {least}; got {value!r}.")
+    return value
+
+
+def _sizes(leaves: dict[str, list[Any]], structures: dict[str, Any]) -> tuple[int | None, int | None]:
+    """Return the numbers of rows and times of inputs, checked: all that compiled code reads by address.
+
+    Raises:
+        ValueError: that names the input which has no numbers in order here, or another size than the others.
+    """
+    sizes: dict[str, tuple[int, str]] = {}
+    device: tuple[torch.device, str] | None = None
+    for tree in ("carry", "now", "row"):
+        for label, leaf in zip(labels(structures[tree], tree), leaves[tree], strict=True):
+            shared, tensor = type(leaf) is Shared, plain(leaf)
+            name = f"`Program({tree}=...)`" + (f", its {label}," if label != tree else "")
+            if shared and tree == "carry":
+                raise ValueError(f"{name} must have rows; got a `Shared` tensor.")
+            if not isinstance(tensor, Tensor):
+                raise ValueError(f"{name} must be a tensor; got {type(tensor).__name__}.")
+            if tensor.is_nested or tensor.is_quantized or tensor.layout is not torch.strided:
+                kind = "nested" if tensor.is_nested else f"{tensor.layout}, {tensor.dtype}"
+                raise ValueError(f"{name} must be dense; got a tensor that is {kind}.")
+            if device is None:
+                device = tensor.device, name
+            elif tensor.device != device[0] and tensor.dim() > 0:
+                raise ValueError(
+                    f"{name} must be on {device[0]} like {device[1].rstrip(',')}; got one on {tensor.device}."
+                )
+            kinds = [] if shared else ["rows"]
+            kinds += ["times"] if tree == "now" else []
+            if tensor.dim() < len(kinds):
+                raise ValueError(
+                    f"{name} must begin with {' and '.join(kinds)}; got the shape {tuple(tensor.shape)}."
+                )
+            for kind, size in zip(kinds, tensor.shape, strict=False):
+                known, first = sizes.setdefault(kind, (size, name))
+                if known != size:
+                    raise ValueError(f"{name} must have {known} {kind} like {first.rstrip(',')}; got {size}.")
+    return sizes.get("rows", (None, ""))[0], sizes.get("times", (None, ""))[0]
+
+
+class Given(NamedTuple):
+    """The inputs of a call as lists."""
+
+    carry: list[Tensor]
+    now: list[Any]
+    row: list[Any]
+    structures: dict[str, Any]
+    rows: int
+    times: int
+
+    @classmethod
+    def of(cls, carry: Tree, now: Tree, row: Tree, steps: int | None) -> Given:
+        leaves, structures = {}, {}
+        for name, tree in (("carry", carry), ("now", now), ("row", row)):
+            leaves[name], structures[name] = flatten(tree)
+            try:
+                hash(structures[name])
+            except TypeError as error:
+                rule = "must be a tree of tensors and numbers: write `torch.as_tensor` around an array"
+                raise ValueError(f"`Program({name}=...)` {rule}; {error}.") from error
+        rows, times = _sizes(leaves, structures)
+        if rows is None:
+            raise ValueError(
+                "`Program(...)` must be given at least one tensor with a dimension of rows; got none."
+            )
+        if times is None:
+            if steps is None:
+                raise ValueError("`Program(steps=...)` must be given where no input has times; got None.")
+            times = whole("steps", steps, 0)
+        return cls(**leaves, structures=structures, rows=rows, times=times)
+
+    @property
+    def real(self) -> torch.dtype:
+        floats = [plain(leaf).dtype for leaf in (*self.carry, *self.now, *self.row)]
+        return torch.float64 if torch.float64 in floats or torch.float32 not in floats else torch.float32
+
+    @property
+    def formal(self) -> bool:
+        """Return whether there are times, and no numbers: on the meta device a step has the shapes of all."""
+        leaves = (*self.carry, *self.now, *self.row)
+        return self.times > 0 and any(plain(leaf).is_meta for leaf in leaves)
+
+    def trees(self) -> Tree:
+        """The trees (row, now, carry)."""
+        return tuple(self.tree(name, getattr(self, name)) for name in ("row", "now", "carry"))
+
+    def tree(self, name: str, leaves: Sequence[Any]) -> Tree:
+        return unflatten(self.structures[name], iter(leaves))
+
+    def key(self) -> Hashable:
+        parts: list[Hashable] = [(leaf.shape[1:], leaf.dtype) for leaf in self.carry]
+        for skip, leaves in ((2, self.now), (1, self.row)):
+            for leaf in leaves:
+                shared = isinstance(leaf, Shared)
+                tensor = plain(leaf)
+                parts.append((tensor.shape[skip - shared :], tensor.dtype, shared))
+        return tuple(parts), tuple(self.structures.values())
+
+    def ordinary(self) -> Where:
+        """Return where all tensors are, as `ordinary`; False where there are no rows or times."""
+        if self.rows == 0 or self.times == 0:
+            return False
+        return ordinary((*self.carry, *self.now, *self.row))

@@ -1,0 +1,1 @@
+"""The automatic choice between compiled code and plain torch."""

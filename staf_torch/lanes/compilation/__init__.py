@@ -1,0 +1,1 @@
+"""The user's cache of libraries and traces, and the compiler that makes libraries."""

@@ -1,0 +1,1 @@
+"""What a program depends on: objects, names in code, tensors; and whether they are what they were."""

@@ -1,0 +1,1 @@
+"""Objects and decisions that differ from row to row of a batch."""

@@ -1,0 +1,1 @@
+"""Locks of objects that threads share, and small operations in one thread."""

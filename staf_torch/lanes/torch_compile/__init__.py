@@ -1,0 +1,1 @@
+"""Row programs within somebody's `torch.compile`."""
