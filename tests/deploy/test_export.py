@@ -19,7 +19,7 @@ from staf_torch.cli.deployable import deployable, learning
 from staf_torch.cli.export import export, export_learning, main
 from staf_torch.deploy.c_header import runner_c
 from staf_torch.experiments.registry import experiment
-from staf_torch.lanes import philox
+from staf_torch.lanes.trace import philox
 
 needs_cc = pytest.mark.skipif(
     not any(map(shutil.which, ("cc", "gcc", "g++", "clang"))), reason="no C compiler"

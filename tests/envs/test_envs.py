@@ -21,7 +21,7 @@ from staf_torch import (
     rows,
     systems,
 )
-from staf_torch.lanes import philox
+from staf_torch.lanes.trace import philox
 
 gymnasium = pytest.importorskip("gymnasium", reason="needs the extra gym")
 

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from staf_torch import StaFBasis, adp, centers, chase_weights, kernels, lanes, optim, systems, targets
 from staf_torch.adp.loop.step import ClosedLoop
-from staf_torch.lanes import philox
+from staf_torch.lanes.trace import philox
 from staf_torch.metrics.ball_error import StateErrorPass
 from staf_torch.optim.objective import NativeError, Precomputed
 

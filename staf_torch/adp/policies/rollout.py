@@ -13,7 +13,8 @@ from torch import Tensor, nn
 from ...approximation.basis import StaFBasis
 from ...centers import Radius, StateFollowingCenters, ball, cross_polytope, rings
 from ...kernels import ExponentialKernel, GaussianKernel, Kernel
-from ...lanes import call, compiled, each, repeat
+from ...lanes import compiled, each, repeat
+from ...lanes.calls import planned_call as call
 from ...lanes.calls.planned_call import PlannedCall
 from ...lanes.dependencies.contents import Contents
 from ...lanes.per_row.each_row import each_row

@@ -15,7 +15,7 @@ from helpers_adp import uniform as drawn
 from torch import Tensor
 
 from staf_torch import adp, lanes, systems
-from staf_torch.lanes import philox
+from staf_torch.lanes.trace import philox
 
 LQR = adp.LQR(TWO_STATE, COST)
 UNSTABLE = systems.Linear([[0.0, 1.0], [2.0, -1.0]], [[0.0], [1.0]])
