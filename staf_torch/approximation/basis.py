@@ -16,6 +16,7 @@ from ..lanes.row_numbers import over_rows
 from ..lanes.threads.one_thread import small
 from ..local_basis import Degrees, LocalBasis, LocalSpace
 from ..numerics.checks import beside_batch, fail, learns, sampled, trailing, values_of
+from ..numerics.default_device import beside
 from ..numerics.row_checks import check_kernel
 from .coefficient_format import compare, decode, encode, record
 
@@ -257,6 +258,7 @@ class StaFBasis(nn.Module, metaclass=Rowwise):
         values = sampled(target, found, centers, outputs)
         return values if outputs is None else values.movedim(-1, 0)
 
+    @beside
     def ideal_weights(self, x: Tensor, target: Target) -> Tensor:
         """w = K(c(x))^-1 V(c(x)), the minimiser of the native-space error: (..., n) -> (..., M).
 

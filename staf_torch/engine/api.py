@@ -18,6 +18,7 @@ from ..lanes.device.chunks import beside_history, joined
 from ..lanes.row_numbers import over_rows
 from ..lanes.torch_compile.opaque import one_operator
 from ..lanes.tree import plain
+from ..numerics.default_device import beside
 from ..optim.base import UpdateLaw
 from ..signs import Sign
 from . import row_program
@@ -208,6 +209,7 @@ class _ChaseRun:
         everything: whether all results are wanted, or the weights alone.
     """
 
+    @beside
     def __init__(self, problem: Problem, states: Tensor, weights: Tensor | None, *, everything: bool) -> None:
         self._problem, self._warned = problem, False
         given = () if weights is None else (weights if weights.dim() > 1 else Shared(weights),)
@@ -226,6 +228,7 @@ class _ChaseRun:
         parts: tuple[Tensor, ...] = states.split(length, dim=1)
         return parts
 
+    @beside
     def weights(self, states: Tensor, history: bool) -> Tensor:
         """Return the paper's weights at the states (B, C, n): (B, C, M), or those of the first time alone."""
         if self.program is not None:
@@ -243,6 +246,7 @@ class _ChaseRun:
             found, self.carry = over_rows(defined, states, self.carry)
         return found
 
+    @beside
     def results(self, states: Tensor) -> ChaseResult:
         """Return everything at the states (B, C, n)."""
         problem = self._problem

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.utils import _device
 from torch.utils._pytree import tree_map_only
 
+from ..lanes.calls.inputs import uncast
 from ..lanes.trace.tracer import explained
 
 Given = ParamSpec("Given")
@@ -31,16 +32,18 @@ def beside(function: Callable[Given, Found]) -> Callable[Given, Found]:
 
     A default device (`torch.set_default_device`) is of the caller's own tensors. Designs and plans are made
     on the CPU, runs where their states are; an index or a table elsewhere would be read at a false address.
+    Nor does `torch.autocast` reach within: products with the inverse of a Gram matrix have no digits to lose.
     """
 
     @functools.wraps(function)
     def placed(*args: Given.args, **more: Given.kwargs) -> Found:
         try:
-            if _device.CURRENT_DEVICE is None:
-                return function(*args, **more)
-            given = (each.device for each in (*args, *more.values()) if isinstance(each, Tensor))
-            with torch.device(next(given, torch.device("cpu"))):
-                return function(*args, **more)
+            with uncast():
+                if _device.CURRENT_DEVICE is None:
+                    return function(*args, **more)
+                given = (each.device for each in (*args, *more.values()) if isinstance(each, Tensor))
+                with torch.device(next(given, torch.device("cpu"))):
+                    return function(*args, **more)
         except RuntimeError as error:
             if (instead := explained(error, function.__qualname__)) is error:
                 raise

@@ -10,8 +10,9 @@ from typing import Any
 import pytest
 import torch
 from test_c_and_cuda import STRICT, built, needs_gcc, pointer
-from torch import Tensor
+from torch import Tensor, nn
 
+import staf_torch as st
 from staf_torch import lanes
 
 pytestmark = pytest.mark.needs_compiler
@@ -161,3 +162,27 @@ def test_functions_of_float32_are_within_two_units_in_the_last_place() -> None:
     assert program.compiles(x, steps=1)
     for one, other in zip(program(x, steps=1)[1], program.definition(x, steps=1)[1], strict=True):
         torch.testing.assert_close(one, other, rtol=2 * torch.finfo(torch.float32).eps, atol=1e-30)
+
+
+@pytest.mark.parametrize("built", ["before", "within", "never"])
+def test_autocast_reaches_no_program_no_gradient_and_no_chase(built: str) -> None:
+    """Whether code had been built before would decide on the digits, and a fit in bfloat16 has none."""
+    net, x, u = nn.Linear(3, 3), torch.randn(4, 3), torch.randn(4, 5, 3)
+
+    def step(x: Tensor, u: Tensor, _: object) -> tuple[Tensor, Tensor]:
+        x = net(x).tanh() + 0.1 * u
+        return x, x
+
+    def chased() -> Tensor:
+        basis = st.StaFBasis(st.GaussianKernel(0.7), st.StateFollowingCenters(st.rings(3), radius=0.1))
+        return st.chase(u[..., :2], basis.float(), st.targets.Paper(), st.optim.Exact()).weights
+
+    def computed(program: lanes.Program) -> tuple[Tensor, ...]:
+        loss = program(x, u)[1].square().sum()
+        return loss.detach(), *torch.autograd.grad(loss, tuple(net.parameters()))
+
+    with lanes.compiling("never" if built == "never" else "always"):
+        plain = computed(one := lanes.Program(step)), chased()
+        with torch.autocast("cpu", torch.bfloat16):
+            cast = computed(one if built == "before" else lanes.Program(step)), chased()
+    torch.testing.assert_close(cast, plain, rtol=1e-5, atol=1e-6)

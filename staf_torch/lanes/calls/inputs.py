@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from typing import Any, NamedTuple
 
 import torch
@@ -14,23 +15,26 @@ from .planned_call import Where, ordinary
 
 
 class one_precision:  # noqa: N801
-    """Context of a function that may read a network or tensor of another precision than its inputs.
+    """Context of a function that computes in the precision of its inputs, as its machine code does.
+
+    `torch.autocast` changes nothing within, or a result would hang on whether code had been built before.
 
     Args:
         name: of what was called, for the error.
         inputs: trees of tensors.
 
     Raises:
-        ValueError: in place of torch's error on two dtypes.
+        ValueError: in place of torch's error on two dtypes, where it reads a network or tensor of another.
     """
 
     def __init__(self, name: str, *inputs: Tree) -> None:
-        self._name, self._inputs = name, inputs
+        self._name, self._inputs, self._uncast = name, inputs, uncast()
 
     def __enter__(self) -> None:
-        pass
+        self._uncast.__enter__()
 
-    def __exit__(self, kind: Any, error: BaseException | None, _: object) -> None:
+    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
+        self._uncast.__exit__(kind, error, trace)
         if kind is None or kind is not RuntimeError or not re.search("same dtype|scalar type", str(error)):
             return
         floats = [x.dtype for x in map(plain, flatten(self._inputs)[0]) if x.is_floating_point()]
@@ -39,6 +43,20 @@ class one_precision:  # noqa: N801
             f"{self._name}: its inputs are {real}, and a network or tensor that it reads is not: write "
             f"`net.to({real})`, or `net(x.float())` for 7 digits; torch's error: {str(error).strip()}"
         ) from error
+
+
+def uncast() -> AbstractContextManager[object]:
+    """Return a context in which `torch.autocast` is off."""
+    kinds = [kind for kind in ("cpu", "cuda") if torch.is_autocast_enabled(kind)]
+    return _off(kinds) if kinds else nullcontext()
+
+
+@contextmanager
+def _off(kinds: list[str]) -> Iterator[None]:
+    with ExitStack() as off:
+        for kind in kinds:
+            off.enter_context(torch.autocast(kind, enabled=False))
+        yield
 
 
 def whole(name: str, value: object, least: int) -> int:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-from ..calls.inputs import Given
+from ..calls.inputs import Given, uncast
 from ..row_numbers import RowNumbers, made_of_list, resolving
 from ..tree import Shared, Tree, flatten, plain
 from . import eigenvalues, factorisations
@@ -107,7 +107,7 @@ def trace(
         row = given.tree("row", _inputs(tracer, "row", given.row, 0, 0))
         now = given.tree("now", _inputs(tracer, "now", given.now, NOW, 1))
         carry = _inputs(tracer, "state", given.carry, STEP, 0)
-        with tracer, tracing(tracer), resolving(own), _TorchFunctions(tracer):
+        with uncast(), tracer, tracing(tracer), resolving(own), _TorchFunctions(tracer):
             after, out = _taken(step, given.tree("carry", carry), now, row)
         ends, structure = flatten(after)
         if structure != given.structures["carry"] or _forms(ends) != _forms(carry):
