@@ -7,6 +7,8 @@ red). Nothing is shown where the log of `staf_torch` takes no warnings either, o
 
 A thread looks four times a second at what is open, and ends when nothing is. So a sign costs a call a few
 microseconds, and code that never returns to Python is shown as well. Nothing here imports torch.
+
+`Progress` is what experiments are given for their loops, `printed` what commands print with.
 """
 
 from __future__ import annotations
@@ -21,11 +23,12 @@ import shutil
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, ParamSpec, TypeVar
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
+_T = TypeVar("_T")
 _log = logging.getLogger(__name__)
 FIRST, EVERY = 1.5, 10.0
 """s before anything is shown, and from a line to the next."""
@@ -255,3 +258,60 @@ def _forked() -> None:
 atexit.register(_open.clear)  # a thread that writes while Python ends would abort it
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_forked)
+
+
+class Progress:
+    """Report how far long loops of an experiment are.
+
+    Args:
+        listener: is told the share of the loop that is done, and nothing is shown; None: `signs`.
+
+    Example:
+        >>> for radius in Progress().each([0.1, 0.2], "radii"):
+        ...     pass
+    """
+
+    def __init__(self, listener: Callable[[float], None] | None = None) -> None:
+        self._listener = listener
+
+    def each(self, items: Sequence[_T], what: str) -> Iterator[_T]:
+        """Yield the items; each counts as done when the next one is asked for."""
+        with self.over(len(items), what) as advance:
+            for item in items:
+                yield item
+                advance(1)
+
+    @contextlib.contextmanager
+    def over(self, total: int, what: str) -> Iterator[Callable[[int], None]]:
+        """Yield a function to be told of every few steps that are done.
+
+        Args:
+            total: number of steps.
+            what: what is counted, for the message.
+        """
+        if self._listener is None:
+            with Sign("", total, what) as sign:
+                yield sign.advance
+            return
+        tell, done = self._listener, 0
+
+        def advance(steps: int) -> None:
+            nonlocal done
+            done += steps
+            tell(done / total)
+
+        yield advance
+
+
+SHOWN = Progress()
+"""Signs of life: what a program that asks for nothing else gets."""
+
+
+def printed(text: str) -> int:
+    """Write a text to stdout and return the exit code 0, also to a reader with enough (`| head -1`)."""
+    try:
+        sys.stdout.write(text)
+        sys.stdout.flush()
+    except BrokenPipeError:  # what is left to write at the end of the process goes nowhere
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 0

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from staf_torch.experiments.registry import experiment
 from staf_torch.figures.style import keep_figures
-from staf_torch.results.progress import Progress
+from staf_torch.signs import Progress
 
 CASES: dict[str, str] = {
     "adp": "experiment=adp duration=0.3 dt=0.005 trajectories=2",

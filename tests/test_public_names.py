@@ -27,7 +27,7 @@ from command_line import ROOT, environment
 import staf_torch
 from staf_torch.cli.site import build
 from staf_torch.cli.site.formulas import typeset
-from staf_torch.cli.site.names import public_names
+from staf_torch.cli.site.pages import public_names
 from staf_torch.lanes.compilation import compiler
 from staf_torch.sweeps.python_api import Runs, sweep
 

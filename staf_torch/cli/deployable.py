@@ -26,9 +26,8 @@ from ..deploy.data_sheet import Port
 from ..experiments.adp import innermost, learner
 from ..numerics.checks import fail, integer
 from ..results import run_record as records
-from ..results.files import HISTORY, HYDRA
+from ..results.files import HISTORY, HYDRA, UnreadableError, read_bytes
 from ..results.run_directory import History
-from ..results.untrusted import UnreadableError, read_bytes
 from ..settings.adp import adp_problem
 from ..settings.chase import chase_problem
 from ..settings.trust import foreign_settings, refusal

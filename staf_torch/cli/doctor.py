@@ -23,9 +23,9 @@ from ..lanes.compilation.compiler import find_compiler
 from ..lanes.device.cuda import kernel_compiler
 from ..optim import SteepestDescent
 from ..results.build import installed
+from ..signs import printed
 from ..systems import Oscillator, simulate
 from ..targets import Paper
-from .printing import printed
 
 _PACKAGES = ("torch", "numpy", "hydra-core", "omegaconf", "matplotlib", "scipy", "pandas", "pyarrow")
 _EXPECTED = 6.23712254984

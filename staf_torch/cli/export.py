@@ -16,17 +16,15 @@ from torch import Tensor
 from .. import __version__
 from ..deploy import c_header, data_sheet, export_learning_c, formats, trace
 from ..deploy.data_sheet import Port
+from ..deploy.formats import in_loops
 from ..deploy.names import made_name
-from ..deploy.onnx_loops import in_loops
 from ..lanes.emit.identifiers import checked_names
 from ..numerics.checks import choice, fail
 from ..results.build import processor
-from ..results.files import write_text
-from ..results.untrusted import visible
+from ..results.files import visible, write_text
 from ..settings.chase import DTYPES
-from ..signs import Sign
+from ..signs import Sign, printed
 from .deployable import CarriesPlanError, Deployable, Learner, deployable, learning
-from .printing import printed
 
 _PORTS = ("state", "control", "value", "gradient", "x", "u", "uniform")  # names of inputs and outputs
 ENDINGS = {"onnx": ".onnx", "pt2": ".pt2", "aoti": ".aoti.pt2", "c": ".h"}

@@ -18,9 +18,8 @@ from hydra import compose, initialize_config_dir
 from .. import __version__
 from ..results.build import source
 from ..settings import config_directory
-from ..signs import Sign
+from ..signs import Sign, printed
 from ..sweeps.hydra_compat import VERSION, find_launcher, full_errors, is_about_settings, program
-from .printing import printed
 
 find_launcher()
 _PARTS = {

@@ -9,15 +9,13 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from ..results.files import RUNNING, UNFINISHED, write_bytes
+from ..results.files import RUNNING, UNFINISHED, visible, write_bytes
 from ..results.reader import Collection, collect
-from ..results.untrusted import visible
-from ..signs import Sign
+from ..signs import Sign, printed
 from ..tables import Layout, Print, Style, Table, json_text, latex_text, parquet_bytes, tabulate
 from ..tables.aggregate import AGGREGATES
 from ..tables.latex import parts
 from ..tables.model import escaped
-from .printing import printed
 
 
 def markdown_text(table: Table, about: Print) -> str:

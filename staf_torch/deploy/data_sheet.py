@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.export import ExportedProgram
 
-from ..results.untrusted import visible
+from ..results.files import visible
 from ..signs import Sign
 
 CALLS = 10_000

@@ -5,8 +5,8 @@ from importlib.util import find_spec as _find_spec
 if _find_spec("gymnasium") is None:
     raise ImportError("staf_torch.envs needs Gymnasium: pip install 'staf_torch[gym]'.")
 
-from .classic_control import classic_control as classic_control
 from .environment_plant import EnvironmentPlant as EnvironmentPlant
+from .environment_plant import classic_control as classic_control
 from .episodes import Agent as Agent
 from .episodes import Episodes as Episodes
 from .plant_env import OWN_PLANT as OWN_PLANT

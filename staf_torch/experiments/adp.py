@@ -22,12 +22,12 @@ from ..figures.closed_loop import AdpHistory, draw_adp
 from ..figures.style import draws, images
 from ..lanes.tree import flatten, unflatten
 from ..metrics.closed_loop import adp_metrics
-from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.adp import adp_problem
 from ..settings.chase import make_metrics
+from ..signs import SHOWN, Progress
 from ..systems import Plant
-from ..tables.columns import significant
+from ..tables.model import significant
 from .numbers_of_jobs import RowsOfJobs, in_calls
 from .registry import BatchedExperiment, Metrics
 from .scenes import animation_kind, loop_scene, write_animation

@@ -19,10 +19,10 @@ from ..figures.closed_loop import draw_comparison, draw_initial_weights
 from ..figures.style import draws, images
 from ..metrics.closed_loop import comparison_row, regulated
 from ..numerics.checks import COMMAND_LINE, fail, positive_real, vector
-from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.adp import adp_problem, changed
 from ..settings.chase import plain
+from ..signs import SHOWN, Progress
 from ..tables import Table
 from .adp import learner, solve
 from .registry import Metrics

@@ -16,12 +16,12 @@ from ..adp import ConcurrentLearning, Controller, IdentifyingTracker, LoopResult
 from ..figures.closed_loop import TrackingHistory, draw_tracking
 from ..figures.style import draws, images
 from ..metrics.closed_loop import tracking_metrics
-from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.adp import build, value_basis
 from ..settings.chase import horizon, initial_states, placement, plain, seed_of
+from ..signs import SHOWN, Progress
 from ..systems import TwoState, TwoStateTracking
-from ..tables.columns import significant
+from ..tables.model import significant
 from .adp import recorded
 from .registry import Metrics
 from .scenes import tracking_scene, write_animation

@@ -19,11 +19,11 @@ from ..adp.safety.conditions import Constraint
 from ..figures.animation import Curves, Scene
 from ..figures.closed_loop import AvoidanceHistory, draw_avoidance
 from ..figures.style import draws
-from ..metrics.safety import constraint_metrics
+from ..metrics.closed_loop import constraint_metrics
 from ..numerics.checks import COMMAND_LINE, choice, integer, positive_real
-from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.chase import generator_of, horizon, placement
+from ..signs import SHOWN, Progress
 from ..systems import ControlAffineSystem, Linear
 from .registry import Metrics, finite
 from .scenes import animation_kind, frames, write_animation

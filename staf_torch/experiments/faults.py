@@ -16,9 +16,9 @@ from ..adp import LQR, AdaptiveLQR, Cost, IntegralWindows, LeastSquares, LoopRes
 from ..figures.closed_loop import FaultPicture, draw_faults
 from ..figures.style import draws
 from ..numerics.checks import COMMAND_LINE, choice, integer, positive_real
-from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.chase import generator_of, plain
+from ..signs import SHOWN, Progress
 from .registry import Metrics
 from .study import Method, Study, recorded_times
 

@@ -27,10 +27,10 @@ from ..kernels import ExponentialKernel, GaussianKernel, Kernel
 from ..local_basis import evaluate_scaled, newton_space
 from ..numerics.checks import COMMAND_LINE, fail, integer, positive_real
 from ..results.files import grouped
-from ..results.progress import SHOWN, Progress
 from ..results.reader import Value
 from ..results.run_directory import RunDirectory
 from ..settings.chase import DTYPES, chase_problem, plain
+from ..signs import SHOWN, Progress
 from ..tables import Table
 from ..targets import Paper
 from .registry import Metrics, finite

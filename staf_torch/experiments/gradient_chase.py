@@ -17,12 +17,12 @@ from omegaconf import DictConfig
 from ..figures.chase import ChaseHistory, draw_chase
 from ..figures.style import draws, images
 from ..numerics.checks import COMMAND_LINE, flag
-from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.chase import ChaseProblem, Parts, chase_problem, warnings_to
 from ..settings.plain import PlainSettings, to_read
+from ..signs import SHOWN, Progress
 from ..systems import Units
-from ..tables.columns import significant
+from ..tables.model import significant
 from .chase_batch import Outcome, simulate
 from .registry import BatchedExperiment, Metrics
 from .scenes import animation_kind, chase_scene, write_animation

@@ -16,9 +16,9 @@ from ..adp import ConcurrentTracker, Measured, ParametricPlant, QuadraticCost
 from ..figures.closed_loop import GainSets, draw_gain_sets
 from ..figures.style import draws
 from ..numerics.checks import COMMAND_LINE, fail, integer, non_negative, positive_real, real, vector
-from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.chase import generator_of, plain, seed_of
+from ..signs import SHOWN, Progress
 from .registry import Metrics
 from .study import Method, Study, recorded_times
 

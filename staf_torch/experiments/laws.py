@@ -19,9 +19,9 @@ from ..figures.style import draws
 from ..metrics.ball_error import StateErrorPass
 from ..numerics.checks import COMMAND_LINE, fail, integer, positive_real, vector
 from ..optim import UpdateLaw
-from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.chase import ChaseProblem, chase_problem, plain
+from ..signs import SHOWN, Progress
 from ..systems import simulate
 from ..tables import Table
 from . import chase_batch

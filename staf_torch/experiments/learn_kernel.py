@@ -16,16 +16,16 @@ from torch import Tensor
 from ..approximation.basis import StaFBasis
 from ..centers import ConstantRadius, StateFollowingCenters, probe_points
 from ..engine import chase
-from ..figures.learning import LearnedKernel, draw_learned_kernel
+from ..figures.chase import LearnedKernel, draw_learned_kernel
 from ..figures.style import draws
 from ..kernels import Kernel
 from ..lanes import rows
 from ..local_basis import evaluate_scaled
 from ..numerics.checks import COMMAND_LINE, fail, integer, positive_real
-from ..results.progress import SHOWN, Progress
 from ..results.reader import Value
 from ..results.run_directory import RunDirectory
 from ..settings.chase import ChaseProblem, chase_problem
+from ..signs import SHOWN, Progress
 from ..systems import simulate
 from ..tables import Table
 from .registry import Metrics, finite

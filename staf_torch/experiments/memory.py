@@ -16,9 +16,9 @@ from ..figures.chase import MemoryPicture, draw_memory
 from ..figures.style import draws
 from ..numerics.checks import COMMAND_LINE, fail, integer, positive_real
 from ..online.experience_memory import ExperienceMemory
-from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.chase import ChaseProblem, chase_problem
+from ..signs import SHOWN, Progress
 from ..systems import simulate
 from ..tables import Table
 from .registry import Metrics, finite

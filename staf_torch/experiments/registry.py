@@ -32,7 +32,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from ..numerics.checks import COMMAND_LINE, choice, fail
-from ..results.progress import SHOWN, Progress
+from ..signs import SHOWN, Progress
 
 Metrics = dict[str, float | None]
 """Name to number; None where there is nothing finite to report."""

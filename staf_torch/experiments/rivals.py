@@ -18,10 +18,10 @@ from ..adp import BoxDDP, SampledProblem
 from ..figures.closed_loop import draw_rivals
 from ..figures.style import draws
 from ..numerics.checks import COMMAND_LINE, choice, integer
-from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.chase import plain, seed_of
-from ..tables.columns import significant
+from ..signs import SHOWN, Progress
+from ..tables.model import significant
 from .registry import Metrics
 from .rival_methods import METHODS, Begin, Rival, UnsuitableError, ipopt_program
 from .rival_plants import CASES, RivalPlant

@@ -14,12 +14,12 @@ from ..adp.loop.simulation import OptimumSettings
 from ..adp.safety.box_filter import walls
 from ..figures.closed_loop import BoxHistory, draw_box
 from ..figures.style import draws
-from ..metrics.safety import constraint_metrics
+from ..metrics.closed_loop import constraint_metrics
 from ..numerics.checks import COMMAND_LINE, fail, flag, integer, positive_real
-from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.adp import make_cost, optimum_settings, plant
 from ..settings.chase import generator_of, horizon, initial_states, placement, plain, seed_of
+from ..signs import SHOWN, Progress
 from ..systems import Barrier, ControlAffineSystem, Plant
 from .registry import Metrics, finite
 from .study import Method, Study, label_key, write_history

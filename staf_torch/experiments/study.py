@@ -14,7 +14,7 @@ from ..figures.style import images
 from ..results.run_directory import Printable, RunDirectory
 from ..systems import Plant
 from ..tables import Style, Table
-from ..tables.columns import significant
+from ..tables.model import significant
 from .registry import Metrics, finite
 
 if TYPE_CHECKING:  # `adp` is .1 s, which chases do not need

@@ -19,9 +19,9 @@ from ..figures.style import draws
 from ..figures.theory import Feasibility, LayoutCurve, draw_exponential_bound, draw_feasibility, draw_layouts
 from ..kernels import ExponentialKernel
 from ..numerics.checks import COMMAND_LINE, fail, integer, positive_real
-from ..results.progress import SHOWN, Progress
 from ..results.run_directory import RunDirectory
 from ..settings.chase import ChaseProblem, LocalProblem, chase_problem, local_problem, numbers
+from ..signs import SHOWN, Progress
 from ..tables import Table
 from .registry import Metrics, finite, log_slope
 from .study import report

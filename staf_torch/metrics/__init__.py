@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ..numerics.row_checks import check_metric
-from ..results.metric_info import MetricInfo
+from ..results.run import MetricInfo
 
 __all__ = ["Metric", "MetricInfo"]
 

@@ -30,21 +30,24 @@ from .files import (
     RUNNING,
     SWEEP,
     UNFINISHED,
+    UnreadableError,
     is_free,
     is_number,
+    parse_object,
     parse_overrides,
     partial_name,
     plain,
+    read_lines,
+    read_object,
+    visible,
 )
 from .files import Value as Value
-from .metric_info import read_infos
 from .run import ABOUT as ABOUT
 from .run import Collection as Collection
 from .run import RecordedRun as RecordedRun
 from .run import Skipped as Skipped
 from .run import identity as identity
-from .run import mixed, versions
-from .untrusted import UnreadableError, parse_object, read_lines, read_object, visible
+from .run import mixed, read_infos, versions
 
 _LISTED = 8  # jobs that have not started, by their numbers
 _UNSAID = {RUNNING: "has not ended: it goes on, or was killed", FAILED: "no reason was left", COMPLETED: None}

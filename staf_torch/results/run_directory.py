@@ -16,8 +16,19 @@ from typing import Any, BinaryIO, Protocol, TypeVar
 import numpy as np
 from numpy.lib.npyio import NpzFile
 
-from .files import FIGURES, HISTORY, METRICS, open_after, partial_name, write_bytes, write_metrics, write_text
-from .untrusted import UnreadableError, open_regular, visible
+from .files import (
+    FIGURES,
+    HISTORY,
+    METRICS,
+    UnreadableError,
+    open_after,
+    open_regular,
+    partial_name,
+    visible,
+    write_bytes,
+    write_metrics,
+    write_text,
+)
 
 T = TypeVar("T")
 _HELD = 2**26

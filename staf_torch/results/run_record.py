@@ -18,11 +18,10 @@ from omegaconf.errors import OmegaConfBaseException
 from .._version import __version__
 from ..numerics import COMMAND_LINE, fail
 from .build import build, checksums, damaged, differences, imported, machine, record_checksum
-from .files import COMPLETED, METRICS, ROWS, flatten, is_free, plain, write_text
+from .files import COMPLETED, METRICS, ROWS, UnreadableError, flatten, is_free, plain, read_object, write_text
 from .files import RUN as RUN
 from .files import SWEEP as SWEEP
-from .metric_info import MetricInfo
-from .untrusted import UnreadableError, read_object
+from .run import MetricInfo
 
 _log = logging.getLogger(__name__)
 _TOLD = 4  # differences that a message names

@@ -34,7 +34,7 @@ from ..kernels import Kernel
 from ..metrics import Metric
 from ..numerics.checks import COMMAND_LINE, choice, fail, flag, integer, positive_real, real, vector
 from ..optim import UpdateLaw
-from ..results.metric_info import OWN
+from ..results.run import OWN
 from ..systems import ControlAffineSystem, Units, simulate
 from .plain import PlainSettings
 from .plain import plain as plain

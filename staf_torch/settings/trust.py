@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..results.untrusted import visible
+from ..results.files import visible
 from . import config_directory
 
 _TARGET = re.compile(r"_target_: *(staf_torch\.[\w.]+)")

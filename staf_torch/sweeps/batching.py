@@ -23,9 +23,9 @@ from ..experiments.registry import (
     experiment,
 )
 from ..figures.style import in_a_sweep
-from ..results.progress import SHOWN, Progress
 from ..settings.plain import to_read
 from ..settings.suggestions import without_option, without_setting
+from ..signs import SHOWN, Progress
 from .workers import LostError
 
 _log = logging.getLogger(__name__)

@@ -22,9 +22,8 @@ from omegaconf import DictConfig, OmegaConf
 from ..figures.style import FigurePaper, draws, printed_on
 from ..numerics import COMMAND_LINE, fail
 from ..results import run_record as records
-from ..results.files import COMPLETED, FAILED, PAGE, ROWS
+from ..results.files import COMPLETED, FAILED, PAGE, ROWS, links_in, visible
 from ..results.reader import RecordedRun, collect
-from ..results.untrusted import links_in, visible
 from . import lock
 from .batching import sentence
 from .hydra_compat import as_typed, end_sweep, parse_override, sweep_size

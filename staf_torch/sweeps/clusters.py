@@ -13,7 +13,7 @@ from types import FrameType
 from typing import Any
 
 from ..numerics.checks import choice
-from ..results.progress import Progress
+from ..signs import Progress
 from .batching import Batch, Done
 from .executors import Executor, GivenUpError, Inline, Process, pack, solve_elsewhere, unpack
 from .workers import LostError, beginning, check, end_with

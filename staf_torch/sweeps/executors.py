@@ -19,8 +19,8 @@ from omegaconf import DictConfig
 
 from ..figures.style import FigurePaper, in_a_sweep, printed_on
 from ..numerics.checks import integer
-from ..results.progress import SHOWN, Progress
 from ..settings.plain import ManySettings
+from ..signs import SHOWN, Progress
 from .batching import (
     DEFERRED,
     Batch,

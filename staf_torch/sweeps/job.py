@@ -21,9 +21,8 @@ from ..lanes.compilation.compiler import compiler
 from ..numerics.checks import COMMAND_LINE, choice
 from ..results import run_record as records
 from ..results.files import FIGURES, METRICS
-from ..results.progress import SHOWN, Progress
 from ..settings.chase import make_metrics, units_of
-from ..signs import Sign
+from ..signs import SHOWN, Progress, Sign
 from . import lock
 from .batching import DEFERRED, USER_ERRORS, Outcome, completion, reason, sentence
 from .hydra_compat import About

@@ -18,8 +18,7 @@ from ..lanes.compilation.compiler import compiler
 from ..numerics.checks import choice, integer
 from ..results import run_record as records
 from ..results.files import METRICS, ROWS, RUN, partial_name
-from ..results.progress import Progress
-from ..signs import Pace, Sign, write
+from ..signs import Pace, Progress, Sign, write
 from . import lock, table, workers
 from .batching import Outcome, reason
 from .clusters import executor

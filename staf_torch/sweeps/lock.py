@@ -13,7 +13,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from ..results.untrusted import UnreadableError, read_object
+from ..results.files import UnreadableError, read_object
 
 NAME = ".lock"
 _BEAT, _STALE = 30.0, 300.0  # s: how often the owner touches the file, and when another host counts it dead

@@ -23,15 +23,13 @@ from ..figures.style import keep_figures
 from ..numerics.checks import choice, fail
 from ..results import reader
 from ..results import run_record as records
-from ..results.files import FAILED, FIGURES, HISTORY, RUN, parse_overrides
+from ..results.files import FAILED, FIGURES, HISTORY, RUN, UnreadableError, parse_overrides, read_bytes
 from ..results.reader import Collection, Value, collect, identity, read_record
 from ..results.run_directory import History
-from ..results.untrusted import UnreadableError, read_bytes
 from ..signs import Sign
 from ..tables import Layout, Style, Table, html_text, tabulate
 from ..tables.aggregate import lost_share
-from ..tables.columns import significant
-from ..tables.model import data_frame, require
+from ..tables.model import data_frame, require, significant
 from . import callbacks
 from .batching import sentence
 from .hydra_compat import application

@@ -18,13 +18,12 @@ import numpy as np
 from ..figures.style import images
 from ..figures.sweep import SEED, SWEEP_FIGURES
 from ..results.files import COMPLETED, PAGE, ROWS, SWEEP, TABLE, parse_overrides
-from ..results.metric_info import MEANINGS
 from ..results.reader import Collection, Value, collect, identity, read_record, read_rows
-from ..results.run import as_text
+from ..results.run import MEANINGS, as_text
 from ..results.run_directory import RunDirectory
 from ..results.run_record import read
 from ..tables import Layout, Style, Table, latex_text, tabulate
-from ..tables.columns import PrintedColumn, show
+from ..tables.model import PrintedColumn, show
 
 _log = logging.getLogger(__name__)
 _MOST_ROWS = 1000  # of a table that have a line of their own in the report

@@ -9,8 +9,7 @@ from pathlib import Path
 
 from .. import __version__
 from ..results import run_record as records
-from ..results.files import FREE, is_free
-from ..results.untrusted import visible
+from ..results.files import FREE, is_free, visible
 from ..settings.trust import may_run_code
 from .callbacks import refuse_many
 from .hydra_compat import overrides_in, parse_override

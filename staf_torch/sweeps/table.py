@@ -22,12 +22,11 @@ from ..experiments.registry import check_animation
 from ..lanes.compilation.compiler import compiler
 from ..results import run_record as records
 from ..results.build import checksums, damage, modules
-from ..results.files import ROWS, is_free, open_after, partial_name
-from ..results.progress import Progress
+from ..results.files import ROWS, UnreadableError, is_free, open_after, parse_object, partial_name, read_lines
 from ..results.run_directory import RunDirectory
-from ..results.untrusted import UnreadableError, parse_object, read_lines
 from ..settings.chase import make_metrics, units_of
 from ..settings.plain import ManySettings
+from ..signs import Progress
 from . import workers
 from .batching import Computed, Failed, Outcome, Written, are_light, completion, reason
 from .executors import Executor, compute

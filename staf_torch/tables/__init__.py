@@ -5,9 +5,9 @@ from ..results.reader import RecordedRun as RecordedRun
 from ..results.reader import collect as collect
 from .aggregate import Layout as Layout
 from .aggregate import tabulate as tabulate
-from .columns import Style as Style
 from .latex import Print as Print
 from .latex import latex_text as latex_text
+from .model import Style as Style
 from .model import Table as Table
 from .model import html_text as html_text
 from .model import json_text as json_text

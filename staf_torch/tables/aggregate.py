@@ -11,13 +11,10 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from ..numerics import TABLE_COMMAND, fail
-from ..results.files import COMPLETED, grouped, is_number
-from ..results.metric_info import OWN
+from ..results.files import COMPLETED, grouped, is_number, visible
 from ..results.reader import Collection, RecordedRun, Value, identity
-from ..results.run import as_text
-from ..results.untrusted import visible
-from .columns import Column, Row, Style
-from .model import Table
+from ..results.run import OWN, as_text
+from .model import Column, Row, Style, Table
 
 _SERIES = 200  # degrees of freedom from which the expansion is more accurate than 1e-12
 _MOST = 6  # metrics that a table shows where none is declared a headline

@@ -9,9 +9,8 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 
 from ..numerics import TABLE_COMMAND, fail
-from ..results.untrusted import visible
-from .columns import Number, PrintedColumn, significant
-from .model import Table
+from ..results.files import visible
+from .model import Number, PrintedColumn, Table, significant
 
 _SPECIAL = {character: f"\\{character}" for character in "{}$&#_%"} | {
     "\\": r"\textbackslash{}",

@@ -15,8 +15,8 @@ from helpers_experiments import Ran, ran, run
 from staf_torch import adp, systems
 from staf_torch.experiments import adp_comparison
 from staf_torch.experiments.adp import LoopSolution, Regulation, count_the_restless, held_radius
-from staf_torch.results.progress import Progress
 from staf_torch.settings.adp import adp_problem
+from staf_torch.signs import Progress
 
 SHORT = ("experiment=adp", "duration=0.1", "dt=0.005", "figures=false")
 

@@ -21,9 +21,9 @@ from variants import LAWS
 from staf_torch import predictors
 from staf_torch.experiments import chase_batch, laws, memory
 from staf_torch.experiments.gradient_chase import ChaseSolution, GradientChase
-from staf_torch.results.progress import Progress
 from staf_torch.settings import config_directory
 from staf_torch.settings.chase import ChaseProblem, chase_problem
+from staf_torch.signs import Progress
 from staf_torch.systems import trajectory
 
 SHORT = ("dt=0.05", "duration=0.5", "settle_time=0.2")

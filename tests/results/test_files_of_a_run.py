@@ -16,10 +16,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as some
 
-from staf_torch.results.files import flatten, open_after, parse_overrides, write_metrics, write_text
-from staf_torch.results.progress import Progress
+from staf_torch.results.files import (
+    UnreadableError,
+    flatten,
+    open_after,
+    parse_overrides,
+    write_metrics,
+    write_text,
+)
 from staf_torch.results.run_directory import History, HistoryWriter, RunDirectory
-from staf_torch.results.untrusted import UnreadableError
+from staf_torch.signs import Progress
 from staf_torch.tables import Table
 
 

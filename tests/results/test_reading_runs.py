@@ -11,9 +11,9 @@ import pytest
 from sweep_runs import BAD_COUNT, typed, write_run, write_sweep
 
 from staf_torch import __version__
-from staf_torch.results.metric_info import OWN, MetricInfo, read_infos
+from staf_torch.results.files import UnreadableError
 from staf_torch.results.reader import Collection, RecordedRun, collect, read_run
-from staf_torch.results.untrusted import UnreadableError
+from staf_torch.results.run import OWN, MetricInfo, read_infos
 
 
 def run(name: str = "a", overrides: Any = None, settings: Any = None, **more: Any) -> RecordedRun:

@@ -16,7 +16,7 @@ from omegaconf import OmegaConf
 from staf_torch import __version__
 from staf_torch.results import build, run_record
 from staf_torch.results.build import checksums, damage, damaged, differences, record_checksum, short
-from staf_torch.results.metric_info import MetricInfo
+from staf_torch.results.run import MetricInfo
 from staf_torch.results.run_directory import HistoryWriter
 from staf_torch.results.run_record import RunRecord
 from staf_torch.sweeps.hydra_compat import parse_override

@@ -23,7 +23,7 @@ from staf_torch.experiments.adp import LoopSolution, Regulation
 from staf_torch.experiments.gradient_chase import ChaseSolution, GradientChase
 from staf_torch.experiments.numbers_of_jobs import ToldOnce
 from staf_torch.results import run_record
-from staf_torch.results.progress import SHOWN
+from staf_torch.signs import SHOWN
 from staf_torch.sweeps import batching
 from staf_torch.sweeps.batching import DEFERRED, Computed, Failed, Outcome
 from staf_torch.sweeps.hydra_compat import parse_override

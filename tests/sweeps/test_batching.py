@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigKeyError, OmegaConfBaseException
 
 from staf_torch.experiments.registry import BatchedExperiment, Metrics
-from staf_torch.results.progress import SHOWN, Progress
+from staf_torch.signs import SHOWN, Progress
 from staf_torch.sweeps.batching import (
     DEFERRED,
     Computed,

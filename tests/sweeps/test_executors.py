@@ -20,8 +20,8 @@ from omegaconf import DictConfig, OmegaConf
 import staf_torch
 from staf_torch.experiments.registry import Metrics
 from staf_torch.results.files import write_metrics
-from staf_torch.results.progress import SHOWN, Progress
 from staf_torch.settings.plain import ManySettings
+from staf_torch.signs import SHOWN, Progress
 from staf_torch.sweeps.batching import Batch, Done, Failed, Outcome, Written, completion, solve
 from staf_torch.sweeps.clusters import Task, executor
 from staf_torch.sweeps.executors import Executor, GivenUpError, compute, pack, solve_elsewhere, unpack

@@ -24,8 +24,8 @@ from omegaconf import DictConfig, OmegaConf
 from staf_torch.experiments.registry import Metrics
 from staf_torch.results import run_record as records
 from staf_torch.results.files import write_metrics
-from staf_torch.results.progress import SHOWN, Progress
 from staf_torch.results.reader import collect
+from staf_torch.signs import SHOWN, Progress
 from staf_torch.sweeps.job import objective
 from staf_torch.sweeps.launcher import SweepProgress
 

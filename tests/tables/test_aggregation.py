@@ -12,8 +12,8 @@ import pytest
 from scipy.stats import t as student
 from sweep_runs import BAD_COUNT, error, write_run, write_sweep
 
-from staf_torch.results.metric_info import MetricInfo
 from staf_torch.results.reader import Collection, RecordedRun, collect
+from staf_torch.results.run import MetricInfo
 from staf_torch.tables import Layout, Style, Table, tabulate
 from staf_torch.tables.aggregate import AGGREGATES, student_quantile
 

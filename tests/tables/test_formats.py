@@ -21,9 +21,8 @@ from tables.test_aggregation import PIVOT
 from staf_torch.cli.table import markdown_text
 from staf_torch.results.reader import Collection, collect
 from staf_torch.tables import Layout, Style, Table, html_text, json_text, latex_text, parquet_bytes, tabulate
-from staf_torch.tables.columns import Column, Number, Row, printed, significant
 from staf_torch.tables.latex import Print, escape, number_text
-from staf_torch.tables.model import data_frame
+from staf_torch.tables.model import Column, Number, Row, data_frame, printed, significant
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from staf_torch.results.untrusted import (
+from staf_torch.results.files import (
     UnreadableError,
     all_visible,
     links_in,

@@ -22,8 +22,7 @@ from typing import Any
 
 from ... import __version__
 from ...signs import Sign
-from .names import PACKAGE, ROOMS
-from .pages import manuals, write_pages
+from .pages import PACKAGE, ROOMS, manuals, write_pages
 
 _HERE = Path(__file__).resolve().parent
 _HEAD = '<!doctype html><meta charset="utf-8"><title>staf_torch</title>'
@@ -144,7 +143,7 @@ def _settings(folder: Path, rooms: Sequence[str]) -> dict[str, Any]:
             "polyfills": ["iframe-worker.js", "versions.js"],  # in place of the theme's, which is on a server
         },
         "extra_css": ["style.css"],
-        "hooks": [str(_HERE / "hooks.py")],
+        "hooks": [str(_HERE / "formulas.py")],
         "plugins": [{"search": {}}, {"offline": {}}, {"mkdocstrings": {"handlers": {"python": _reader()}}}],
         "markdown_extensions": [
             "admonition",

@@ -10,6 +10,7 @@ from __future__ import annotations
 import html
 import re
 from collections.abc import Iterator
+from typing import Any
 
 _FUNCTIONS = {
     *("exp", "log", "ln", "sin", "cos", "tan", "tanh", "max", "min", "det", "diag", "rank", "argmin")
@@ -44,6 +45,11 @@ _CLOSING = {"(": ")", "[": "]", "{": "}"}
 _TEXT = re.compile(r"(<(pre|code|a|h[1-6]|math|script|style|summary|svg|label)\b.*?</\2>|<[^>]*>)", re.DOTALL)
 _BLOCK = re.compile(r'<div class="[^"<>]*highlight"><pre><span></span><code>([^<]+)</code></pre></div>')
 Token = tuple[str, str]
+
+
+def on_page_content(html: str, **kwargs: Any) -> str:
+    """Typeset the formulas of a page: the hook that the site's generator calls."""
+    return typeset(html)
 
 
 def typeset(page: str) -> str:
