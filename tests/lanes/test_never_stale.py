@@ -186,6 +186,48 @@ def test_a_tensor_that_is_given_other_memory_is_read_there() -> None:
         right(picked, lambda x: x[:, whole])
 
 
+class ReadsMatrix(nn.Module):
+    """x sum(A)."""
+
+    def __init__(self, held: nn.Parameter) -> None:
+        super().__init__()
+        self.held = held
+
+    @compiled("a matrix's sum")
+    def forward(self, x: Tensor) -> Tensor:
+        return x * self.held.sum()
+
+
+UNCOUNTED: dict[str, Callable[[Tensor], object]] = {
+    "a target network's copy": lambda held: held.data.copy_(0.9 * held.data + 0.1),
+    "an entry of `.data`": lambda held: held.data.view(-1)[0].add_(1.0),
+    "NumPy": lambda held: np.multiply(held.detach().numpy(), 1.5, out=held.detach().numpy()),
+}
+"""Writes that torch does not count."""
+
+
+@pytest.mark.parametrize("how", UNCOUNTED)
+@pytest.mark.parametrize("size", [1, 90, 200])
+@pytest.mark.parametrize("learned", [True, False])
+def test_a_write_that_torch_does_not_count_is_seen(how: str, size: int, learned: bool) -> None:
+    """Of a tensor of more than 64 kB (200 x 200) where it changes more than single numbers."""
+    if size == 200 and "entry" in how:
+        pytest.skip("64 numbers of it are compared")
+    held = nn.Parameter(torch.rand(size, size, dtype=torch.float64), requires_grad=learned)
+    policy, x = ReadsMatrix(held), torch.rand(3, 2, dtype=torch.float64)
+    ready(policy, x)
+    program = lanes.Program(lambda carry, now, row: (carry * held.sum(), carry))
+    for _ in range(2):
+        program(x, steps=2)
+        policy(x)
+    UNCOUNTED[how](held)
+    torch.testing.assert_close(program(x, steps=2), program.definition(x, steps=2))
+    torch.testing.assert_close(policy(x), x * held.sum())
+    if learned:
+        slopes = [torch.autograd.grad(f(x, steps=2)[0].sum(), held)[0] for f in (program, program.definition)]
+        torch.testing.assert_close(*slopes)
+
+
 def test_closures_of_equal_content_share_a_program_and_others_do_not(notebook: Any) -> None:
     kept = SharedPrograms("a test")
     first = of(kept, notebook.closing(2.0))

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import copy
+import ctypes
 import operator
 from collections.abc import Sequence
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ..row_numbers import all_rows
 
-_VERSION = operator.attrgetter("_version")
+_VERSION, _BYTES = operator.attrgetter("_version"), operator.methodcaller("tobytes")
+_SMALL = 1 << 16  # bytes of a tensor that are compared at every call
+_FEW = 64  # numbers of a larger one
 
 
 def version(tensor: Tensor) -> int:
@@ -25,33 +31,62 @@ def version(tensor: Tensor) -> int:
 class Writes:
     """How tensors are now, to be compared later.
 
-    Torch counts writes to a tensor, but not that ``tensor.data = other`` gives it other memory, as
-    `torch.nn.utils.vector_to_parameters` does. Writes into ``tensor.data`` itself nobody can see.
+    Torch counts writes to a tensor, but none to ``tensor.data`` (``target.data.copy_(...)``) or by NumPy,
+    nor that ``tensor.data = other`` gives it other memory, as `torch.nn.utils.vector_to_parameters` does. So
+    memory of the processor is compared: all of it up to 64 kB a tensor and where torch counts nothing, 64
+    numbers of a larger one beside torch's count. On a device it is torch's count alone, as looking waits.
 
     Args:
         tensors: numbers of rows among them.
     """
 
     def __init__(self, tensors: Sequence[Tensor]) -> None:
-        every = [*map(all_rows, tensors)]
-        self._counted = [tensor for tensor in every if not tensor.is_inference()]
-        self._compared = [tensor for tensor in every if tensor.is_inference()]
-        self._placed = [tensor for tensor in self._counted if _has_memory(tensor)]
+        self._tensors = [*map(all_rows, tensors)]
+        self._placed = [tensor for tensor in self._tensors if _has_memory(tensor)]
         # Kept, so that other memory cannot come to lie at the same address meanwhile.
         self._memory = [tensor.untyped_storage() for tensor in self._placed]
-        self._then = self._now()
+        self._addresses = [*map(Tensor.data_ptr, self._placed)]
+        self._views = list[memoryview]()
+        self._samples, compared = list[np.ndarray[Any, Any]](), set[int]()
+        for tensor, address in zip(self._placed, self._addresses, strict=True):
+            if not tensor.is_cpu:
+                continue
+            size = tensor.element_size() * (1 + sum(map(_reach, tensor.shape, tensor.stride())))
+            memory = memoryview((ctypes.c_char * size).from_address(address))
+            if size <= _SMALL or tensor.is_inference():
+                self._views.append(memory)
+                compared.add(id(tensor))
+            else:
+                width = min(tensor.element_size(), 8)
+                self._samples.append(np.frombuffer(memory, f"u{width}")[:: size // (width * _FEW)])
+        self._counted = [each for each in self._tensors if not (id(each) in compared or each.is_inference())]
+        self._look()
+
+    def _look(self) -> None:
+        self._versions = [*map(_VERSION, self._counted)]
+        self._contents = [*map(bytearray, self._views)]  # equal to memory of the same bytes, at once
+        self._parts = [*map(_BYTES, self._samples)]
 
     def again(self) -> Writes:
         """Return how the same tensors are now."""
-        return Writes((*self._counted, *self._compared))
+        if [*map(Tensor.data_ptr, self._placed)] != self._addresses:
+            return Writes(self._tensors)
+        now = copy.copy(self)
+        now._look()
+        return now
 
     def none(self) -> bool:
         """Return whether nothing was written since."""
-        return self._now() == self._then
+        return (
+            [*map(Tensor.data_ptr, self._placed)] == self._addresses  # first: memory may have been given back
+            and self._contents == self._views
+            and [*map(_VERSION, self._counted)] == self._versions
+            and (not self._samples or [*map(_BYTES, self._samples)] == self._parts)
+        )
 
-    def _now(self) -> list[int]:
-        now = [*map(_VERSION, self._counted), *map(Tensor.data_ptr, self._placed)]
-        return [*now, *map(version, self._compared)] if self._compared else now
+
+def _reach(size: int, stride: int) -> int:
+    return (size - 1) * stride
 
 
 def _has_memory(tensor: Tensor) -> bool:
