@@ -228,6 +228,27 @@ def test_a_write_that_torch_does_not_count_is_seen(how: str, size: int, learned:
         torch.testing.assert_close(*slopes)
 
 
+def test_another_default_dtype_is_that_of_the_numbers_that_a_step_makes() -> None:
+    x, before = torch.rand(3, 2, dtype=torch.float64), torch.get_default_dtype()
+
+    class Tenth(nn.Module):
+        @compiled("a tenth")
+        def forward(self, x: Tensor) -> Tensor:
+            return x * torch.full((2,), 0.1)
+
+    policy, program = Tenth(), lanes.Program(lambda x, now, row: (x * torch.full((2,), 0.1), x))
+    ready(policy, x)
+    try:
+        for dtype in (torch.float32, torch.float64, torch.float32):
+            torch.set_default_dtype(dtype)
+            wanted = x * torch.tensor(0.1, dtype=dtype).double()
+            assert torch.equal(policy(x), wanted)
+            assert torch.equal(program(x, steps=1)[0], wanted)
+            assert program.compiles(x, steps=1)
+    finally:
+        torch.set_default_dtype(before)
+
+
 def test_closures_of_equal_content_share_a_program_and_others_do_not(notebook: Any) -> None:
     kept = SharedPrograms("a test")
     first = of(kept, notebook.closing(2.0))

@@ -82,11 +82,12 @@ class Contents:
     def __init__(self, *objects: Any, telling: bool = False, watched: bool = True) -> None:
         walk = self._walk = Walk(io.BytesIO(), telling)
         self.key: tuple[bytes, tuple[object, ...]] | None = None
+        self._default = torch.get_default_dtype()  # of the numbers that code makes
         try:
             for each in objects:
                 walk.dump(each)
             walk.finish()
-            self.key = walk.file.getvalue(), tuple(walk.kept)
+            self.key = walk.file.getvalue() + str(self._default).encode(), tuple(walk.kept)
             self.reason = walk.unwatched
         except Exception as error:  # of any object that a function names: a lock, a deep list, a proxy
             self.reason = f"{type(error).__name__}: {error}"
@@ -140,7 +141,8 @@ class Contents:
         """
         try:
             return (
-                (not self._sized or [*map(len, self._sized)] == self._lengths)
+                torch.get_default_dtype() is self._default
+                and (not self._sized or [*map(len, self._sized)] == self._lengths)
                 and not any(self._walk.empty)
                 # the same objects: nothing else is compared
                 and (not self._modules or [*map(_BASE, self._modules)] == self._bases)

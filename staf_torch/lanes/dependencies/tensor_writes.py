@@ -80,7 +80,7 @@ class Writes:
         return (
             [*map(Tensor.data_ptr, self._placed)] == self._addresses  # first: memory may have been given back
             and self._contents == self._views
-            and [*map(_VERSION, self._counted)] == self._versions
+            and (not self._counted or [*map(_VERSION, self._counted)] == self._versions)
             and (not self._samples or [*map(_BYTES, self._samples)] == self._parts)
         )
 
