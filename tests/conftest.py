@@ -42,7 +42,7 @@ AS_FOR_USERS = (
 """Tests of those rooms, by parts of their names, whose programs are built as users have them: bits of rows
 beside others or rounding are the matter. A filter of streams then takes 8 s to build, and 1 s otherwise."""
 
-logging.getLogger("staf_torch.lanes.choice.short_calls").setLevel("ERROR")  # the suite is many short calls
+logging.getLogger("staf_torch.lanes.calls.choice").setLevel("ERROR")  # the suite is many short calls
 for logger in logging.root.manager.loggerDict.values():
     if isinstance(logger, logging.Logger) and logger.name.startswith("torch"):
         # Else pytest adds its handlers to each of fifty loggers and takes them off again, six times a test.

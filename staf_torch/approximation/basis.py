@@ -13,7 +13,7 @@ from ..centers import StateFollowingCenters
 from ..kernels import Kernel
 from ..lanes.per_row.objects import Rowwise, beyond_rows
 from ..lanes.row_numbers import over_rows
-from ..lanes.threads.one_thread import small
+from ..lanes.threads import small
 from ..local_basis import Degrees, LocalBasis, LocalSpace
 from ..numerics.checks import beside_batch, fail, learns, sampled, trailing, values_of
 from ..numerics.default_device import beside

@@ -12,7 +12,7 @@ from torch.nn.utils import parametrize
 
 from ..lanes.gradients import refuse_gradient
 from ..lanes.per_row.objects import refuse_rows
-from ..lanes.threads.one_thread import alone
+from ..lanes.threads import alone
 from ..numerics.checks import beside_batch, choice, fail, fails, flag, hold, integer, trailing
 from ..numerics.default_device import beside
 from ..numerics.derivatives import row_jacobian

@@ -12,8 +12,7 @@ from torch import Tensor
 
 from ..approximation.basis import StaFBasis, Target
 from ..lanes import Program, Shared
-from ..lanes.choice.short_calls import ShortCall
-from ..lanes.choice.when_compiled import undecided
+from ..lanes.calls.choice import ShortCall, undecided
 from ..lanes.device.chunks import beside_history, joined
 from ..lanes.row_numbers import over_rows
 from ..lanes.torch_compile.opaque import one_operator

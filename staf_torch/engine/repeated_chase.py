@@ -11,8 +11,8 @@ from typing import Any
 from torch import Tensor
 
 from ..lanes import Program
-from ..lanes.calls.planned_call import form, ordinary
-from ..lanes.choice.when_compiled import worth
+from ..lanes.calls.choice import worth
+from ..lanes.calls.inputs import form, ordinary
 from ..lanes.dependencies.lookups import is_users
 from ..lanes.device.chunks import beside_history
 from ..lanes.device.kernel import DeviceCall

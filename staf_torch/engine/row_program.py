@@ -14,8 +14,8 @@ from torch import Tensor, nn
 
 from ..approximation.basis import GramStructure, StaFBasis, Target
 from ..lanes import Program
-from ..lanes.calls.planned_call import say_transformed, served
-from ..lanes.choice.when_compiled import worth
+from ..lanes.calls.choice import say_transformed, worth
+from ..lanes.calls.inputs import served
 from ..lanes.shared_programs import SharedPrograms
 from ..optim.base import UpdateLaw
 from ..optim.objective import NativeError, Objective, Precomputed

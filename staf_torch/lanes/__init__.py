@@ -2,7 +2,7 @@
 
 from . import device as device
 from .adjoint.gradient_call import gradient_memory as gradient_memory
-from .choice.when_compiled import compiling as compiling
+from .calls.choice import compiling as compiling
 from .compiled_methods import compiled as compiled
 from .compiled_methods import ready as ready
 from .per_row.objects import rows as rows

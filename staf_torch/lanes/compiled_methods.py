@@ -3,7 +3,7 @@
 A policy is asked ten times in a test and a hundred thousand times in a control loop. Its class says in one
 line that a method may be compiled, ``@compiled("a policy")``; the method stays plain torch, which is what it
 means. A program serves once the calls in plain torch have taken as long as a compiler, by their operations
-(`plain_time`), and from the hundredth call on at the latest. It is made anew when anything that the owner
+(`calls.choice.PlainTime`), and from the hundredth call on at the latest. It is made anew when anything that the owner
 holds has changed (`contents`), is no part of a pickle or a copy, and is out of the way where somebody traces
 or differentiates. To compile at construction would take seconds of every short test.
 """
@@ -22,17 +22,14 @@ from torch import Tensor, nn
 from torch.utils import _device
 
 from ..signs import Sign
-from .calls.inputs import one_precision
-from .calls.planned_call import at_once, ordinary
-from .calls.planned_call import served as served_by
-from .choice.plain_time import PlainTime
-from .choice.when_compiled import undecided, worth
+from .calls.choice import PlainTime, undecided, worth
+from .calls.inputs import at_once, one_precision, ordinary
+from .calls.inputs import served as served_by
 from .dependencies.contents import BOUND, Contents
 from .program import Program
 from .row_functions import Rows, Trees, is_state
 from .row_numbers import RowNumbers, over_rows, points_of_rows
-from .threads.locks import Mutex
-from .threads.one_thread import ENTRIES, alone
+from .threads import ENTRIES, Mutex, alone
 from .torch_compile.graph_operator import NAMED, spelled
 from .torch_compile.opaque import one_operator
 from .trace.loops import tracing_now

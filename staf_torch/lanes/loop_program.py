@@ -9,8 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from ..signs import Sign
-from .choice.plain_time import PlainTime, RepaysError
-from .choice.short_calls import ShortCall
+from .calls.choice import PlainTime, RepaysError, ShortCall
 from .compiled_methods import methods_of
 from .program import Program
 from .row_numbers import one_by_one
@@ -25,7 +24,7 @@ _SAID, _LONG = 1.5, 3.0  # s after which a loop says that it takes long, and tha
 class LoopProgram:
     """Program of a loop that begins in plain torch, and is compiled from its start where that repays.
 
-    The first step is counted as it runs (`plain_time`). Where all of them take twice as long as a compiler,
+    The first step is counted as it runs (`PlainTime`). Where all of them take twice as long as a compiler,
     it is undone, random numbers too, and the compiled program runs the loop. Else plain torch goes on, and
     says in the log after 1.5 s how long the rest takes, if more than 3 s.
 

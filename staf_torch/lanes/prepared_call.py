@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from .adjoint.gradient_call import GradientCall
-from .calls.inputs import Given, whole
-from .calls.planned_call import PlannedCall, Where, form, ordinary, say_transformed, seen, seen_by_others
+from .calls.choice import say, say_transformed
+from .calls.inputs import Given, Where, form, ordinary, seen, seen_by_others, whole
+from .calls.planned_call import PlannedCall
 from .device.kernel import DeviceCall
-from .log import say
 from .torch_compile.opaque import one_operator
 from .tree import Tree, flatten, unflatten
 

@@ -11,18 +11,17 @@ from torch import Tensor
 
 from ..signs import Sign
 from .adjoint.steps import keeping_step
-from .calls.inputs import Given, one_precision, whole
-from .calls.planned_call import Compiled, seen, served
+from .calls.choice import say
+from .calls.inputs import Given, one_precision, seen, served, whole
+from .calls.planned_call import Compiled
 from .compilation.compiler import machine_code
 from .dependencies.contents import Contents, Derived
 from .emit.cpp import emit
 from .emit.row_c import RowC
-from .log import say
 from .prepared_call import Prepared
 from .row_numbers import over_rows, points_of_rows
 from .texts import Built, Form, kernel, known
-from .threads.locks import Mutex
-from .threads.one_thread import ENTRIES, alone
+from .threads import ENTRIES, Mutex, alone
 from .torch_compile.opaque import one_operator
 from .trace.loops import few_passes, scan, tracing_now
 from .trace.row_independence import doubt, undrawn

@@ -7,7 +7,7 @@ from typing import Any
 
 from torch import Tensor
 
-from .calls import planned_call as call
+from .calls import inputs
 from .calls.planned_call import PlannedCall
 from .prepared_call import Plan
 from .program import Program
@@ -67,7 +67,9 @@ class Rows:
     def __call__(self, *given: Tensor) -> Tensor:
         """Return y with a dimension of one time after the rows, (B, 1, ...); (n,) is one row."""
         # Shapes alone: the caller has looked at the rest.
-        key = tuple([(x.shape, x.stride(), x.dtype, call.processor if x.is_cpu else x.device) for x in given])
+        key = tuple(
+            [(x.shape, x.stride(), x.dtype, inputs.processor if x.is_cpu else x.device) for x in given]
+        )
         plan = self._plans.get(key)
         if plan is not None:
             return plan(given)[0]

@@ -13,7 +13,7 @@ from .dependencies.contents import Contents
 from .dependencies.tensor_writes import Writes
 from .dependencies.told_numbers import leads_by_copies, told_copies
 from .program import Program
-from .threads.locks import Mutex
+from .threads import Mutex
 from .trace.loops import traced_as
 from .trace.step import Step
 

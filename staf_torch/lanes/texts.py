@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from . import trace_files
+from .adjoint.carries import carried
 from .adjoint.steps import ReversedStep
 from .calls.inputs import Given
 from .calls.planned_call import Compiled
@@ -18,7 +19,6 @@ from .emit.cpp import emit
 from .emit.cuda import Dtypes, emit_cuda
 from .emit.tables import Text
 from .row_numbers import RowNumbers
-from .trace.kept_carries import carried
 from .trace.step import Step, Traced, trace
 from .trace.tracer import NotLoweredError
 from .trace_files import Trace

@@ -13,8 +13,7 @@ from torch import Tensor
 from ..approximation.basis import StaFBasis, Target
 from ..centers import probe_points
 from ..lanes import Program, reduce, shared_program
-from ..lanes.choice.plain_time import PlainTime
-from ..lanes.choice.when_compiled import undecided, worth
+from ..lanes.calls.choice import PlainTime, undecided, worth
 from ..lanes.per_row.objects import made_by_rows
 from ..lanes.row_numbers import RowNumbers, over_rows, points_of_rows, some_rows
 from ..local_basis import NewtonSpace, evaluate_scaled, scale

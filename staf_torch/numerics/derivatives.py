@@ -11,7 +11,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from ..lanes.calls.planned_call import seen_by_others
+from ..lanes.calls.inputs import seen_by_others
 
 STEP = 6e-6  # the cube root of the rounding error: a central difference is then good to its square
 

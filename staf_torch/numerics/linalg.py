@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ..lanes.per_row.decisions import in_any_row
-from ..lanes.threads.one_thread import alone, small_in_scipy
+from ..lanes.threads import alone, small_in_scipy
 from .checks import fail, non_negative, positive, vector
 from .default_device import designed_on_cpu
 from .riccati import continuous_solution, discrete_gain, discrete_solution

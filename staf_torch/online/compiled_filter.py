@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..lanes.choice.when_compiled import runs_kernels, worth
+from ..lanes.calls.choice import runs_kernels, worth
 from ..lanes.compilation.compiler import compiled
 from .filter_program import KernelFilter
 from .kalman_filter import LocalFilter

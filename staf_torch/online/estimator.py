@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from ..kernels import Kernel
-from ..lanes.calls.planned_call import seen_by_others
-from ..lanes.threads.locks import ReadWriteLock
+from ..lanes.calls.inputs import seen_by_others
+from ..lanes.threads import ReadWriteLock
 from ..lanes.torch_compile.opaque import opaque
 from ..numerics.checks import fail, integer, trailing
 from ..numerics.default_device import beside, on

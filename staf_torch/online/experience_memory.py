@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from ..approximation.basis import StaFBasis
 from ..lanes.gradients import refuse_gradient
-from ..lanes.threads.locks import ReadWriteLock
+from ..lanes.threads import ReadWriteLock
 from ..numerics.checks import hold, integer, positive_real, trailing
 
 _DRIFT = 4.0  # usual distances between a model and the average of those before it

@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from ..lanes.threads.locks import Mutex
+from ..lanes.threads import Mutex
 from ..numerics.checks import fail
 from .estimator import StreamEstimator
 from .mixture import MixtureRegressor

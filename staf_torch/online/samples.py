@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..lanes.calls.planned_call import readable
+from ..lanes.calls.inputs import readable
 from ..lanes.gradients import refuse_gradient
 from ..numerics.checks import fail, fails
 

@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from ..lanes import Program, repeat
-from ..lanes.choice.plain_time import DIFFERENTIATED
-from ..lanes.choice.when_compiled import undecided, worth
+from ..lanes.calls.choice import DIFFERENTIATED, undecided, worth
 from ..lanes.device.chunks import rows_of, with_rows
 from ..lanes.device.host import capturing
 from ..lanes.gradients import wants_gradient

@@ -130,7 +130,7 @@ SHORT = {
 def test_short_calls_that_are_asked_again_and_again_say_once_what_they_cost(
     name: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    caplog.set_level("WARNING", logger="staf_torch.lanes.choice.short_calls")
+    caplog.set_level("WARNING", logger="staf_torch.lanes.calls.choice")
     call, tick = SHORT[name]
     clock = itertools.count()
     monkeypatch.setattr(time, "perf_counter", lambda: tick * next(clock))

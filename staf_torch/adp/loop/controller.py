@@ -15,7 +15,7 @@ from ...lanes.dependencies.tensor_writes import version
 from ...lanes.gradients import gradients_of, marked
 from ...lanes.per_row.objects import OfRows
 from ...lanes.row_numbers import over_rows
-from ...lanes.threads.one_thread import small
+from ...lanes.threads import small
 from ...lanes.trace.loops import where_rows
 from ...numerics.checks import fail, real, trailing
 from ...numerics.default_device import beside

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ...approximation.basis import StaFBasis
 from ...lanes import Program
-from ...lanes.calls.planned_call import served
+from ...lanes.calls.inputs import served
 from ...lanes.dependencies.contents import Contents
 from ...lanes.gradients import wants_gradient
 from ...lanes.per_row.decisions import decided

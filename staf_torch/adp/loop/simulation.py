@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from ...lanes import Program
-from ...lanes.choice.plain_time import DIFFERENTIATED
-from ...lanes.choice.when_compiled import undecided, worth
+from ...lanes.calls.choice import DIFFERENTIATED, undecided, worth
 from ...lanes.device.chunks import beside_history, joined, rows_of, with_rows
 from ...lanes.gradients import wants_gradient
 from ...lanes.loop_program import LoopProgram

@@ -14,7 +14,7 @@ from ...approximation.basis import StaFBasis
 from ...centers import Radius, StateFollowingCenters, ball, cross_polytope, rings
 from ...kernels import ExponentialKernel, GaussianKernel, Kernel
 from ...lanes import compiled, each, repeat
-from ...lanes.calls import planned_call as call
+from ...lanes.calls import inputs
 from ...lanes.calls.planned_call import PlannedCall
 from ...lanes.dependencies.contents import Contents
 from ...lanes.per_row.each_row import each_row
@@ -22,7 +22,7 @@ from ...lanes.per_row.objects import Rowwise
 from ...lanes.prepared_call import Plan
 from ...lanes.row_functions import Rows, check_states
 from ...lanes.row_numbers import RowNumbers, points_of_rows
-from ...lanes.threads.one_thread import small
+from ...lanes.threads import small
 from ...numerics.checks import fail, integer, object_of, positive_real, trailing
 from ...numerics.default_device import beside, device_of
 from ...numerics.exponential_step import stalls
@@ -286,7 +286,7 @@ class _TwoPrograms:
         return bool(self._one) or (self._roll.compiled and self._improve.compiled)
 
     def __call__(self, x: Tensor) -> Tensor:
-        key = x.shape, x.stride(), x.dtype, call.processor if x.is_cpu else x.device
+        key = x.shape, x.stride(), x.dtype, inputs.processor if x.is_cpu else x.device
         one = self._one.get(key)
         if one is not None:  # the plans read where the numbers are, and not in which shape
             u, roll, improve = one

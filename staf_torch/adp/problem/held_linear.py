@@ -15,7 +15,7 @@ from torch.nn.functional import pad
 from ...lanes.gradients import without_gradient
 from ...lanes.per_row.objects import made_by_rows
 from ...lanes.row_numbers import nonzero
-from ...lanes.threads.one_thread import small
+from ...lanes.threads import small
 from ...numerics.checks import fail, object_of, positive_real
 from ...numerics.default_device import designed_on_cpu
 from ...numerics.derivatives import STEP, central_slopes

@@ -14,7 +14,7 @@ from ...lanes import compiled, repeat, where_rows
 from ...lanes.gradients import gradients_of, marked
 from ...lanes.per_row.decisions import DecidedByRows, of_first
 from ...lanes.per_row.kinds import kinds_of_rows, of_kinds, whichever
-from ...lanes.threads.one_thread import small
+from ...lanes.threads import small
 from ...numerics.checks import fail, one_or_each, positive, positive_real, trailing
 from ...numerics.default_device import beside, device_of
 from ...numerics.repr_text import limits, shown

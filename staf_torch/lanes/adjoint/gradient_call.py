@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..calls.inputs import Given
-from ..calls.planned_call import Compiled, PlannedCall, Where, served
+from ..calls.choice import say
+from ..calls.inputs import Given, Where, served
+from ..calls.planned_call import Compiled, PlannedCall
 from ..device.kernel import DeviceCall
-from ..log import say
 from ..row_numbers import RowNumbers, columns
 from ..tree import Shared, flatten, labels, plain, unflatten
 from .backward import Backward

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from ..trace.graph import NOW, REAL, STEP, Graph, Sizes
-from ..trace.kept_carries import parts
 from ..trace.step_copy import StepCopy
+from .carries import parts
 from .reverse import Reverse
 
 if TYPE_CHECKING:

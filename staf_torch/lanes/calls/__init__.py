@@ -1,1 +1,1 @@
-"""Calls of compiled code: inputs, checked, and what is prepared for those of one form."""
+"""Calls: their inputs, the choice between compiled code and plain torch, and what is prepared of them."""

@@ -1,4 +1,4 @@
-"""A compiled program for inputs of fixed shapes: nothing is found out twice."""
+"""Calls of a compiled program for inputs of fixed shapes: nothing is found out twice."""
 
 from __future__ import annotations
 
@@ -10,17 +10,15 @@ import mmap
 import operator
 import os
 import struct
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from ...signs import Sign
 from ..compilation.compiler import compiled
-from ..log import say
 from ..row_numbers import RowNumbers, columns
 from ..tree import Shared, plain
 
@@ -52,10 +50,6 @@ def fresh(like: Tensor, *shape: int) -> Tensor:
     return torch.frombuffer(memory, dtype=like.dtype, count=size // like.element_size()).view(shape)
 
 
-Form = tuple[torch.Size, tuple[int, ...], torch.dtype, Hashable]
-"""Shape, strides and dtype of an input, whether all rows share it, and its device unless it is the CPU."""
-
-
 class _Slot(ctypes.Structure):
     _fields_ = tuple((n, ctypes.c_int64) for n in ("row", "time", "entry", "entries"))
 
@@ -85,117 +79,6 @@ class Compiled(NamedTuple):
     outputs: tuple[tuple[torch.Size, torch.dtype], ...]
     structure: Any  # of the outputs
     rows: tuple[RowNumbers, ...] = ()  # whose columns follow what a row has once
-
-
-Where = bool | torch.device
-"""What runs compiled code: True for the processor's lanes, a device for its kernels, False for neither."""
-processor: Where = True  # of tensors on the CPU; `device.host` has it be a device
-
-
-def readable(x: Any, recorded: bool) -> bool:
-    """Return whether compiled code may read a tensor where it lies, wherever that is.
-
-    The one rule of all that is given to compiled code, samples of streams, too: a tensor of no subclass,
-    without a pending sign, of which nobody wants a derivative. Device, dtype and layout are the caller's.
-
-    Args:
-        x: the tensor, or anything.
-        recorded: whether one that requires a gradient is refused.
-    """
-    return type(x) in _TENSORS and not (recorded and x.requires_grad) and not x.is_neg()
-
-
-def seen(leaves: Sequence[Any]) -> tuple[tuple[Form, ...], Where]:
-    """Return the forms of inputs, and where they are as `ordinary` has it."""
-    recorded = torch.is_grad_enabled()
-    if seen_by_others():
-        return tuple(map(form, leaves)), False
-    forms: list[Form] = []
-    for leaf in leaves:
-        shared = type(leaf) is Shared
-        x = leaf.tensor if shared else leaf
-        if not (readable(x, recorded) and x.is_cpu):
-            return tuple(map(form, leaves)), ordinary(leaves)
-        forms.append((x.shape, x.stride(), x.dtype, shared))
-    return tuple(forms), processor
-
-
-def ordinary(leaves: Sequence[Any], *, recorded: bool | None = None) -> Where:
-    """Return where plain tensors are of which nobody wants a derivative, False of others.
-
-    All that is given to compiled code passes here: dense, `readable`, on the CPU or one CUDA device. Under a
-    tracer, a transform of torch.func or another mode the operations themselves are wanted.
-
-    Args:
-        leaves: the tensors, `Shared` ones among them.
-        recorded: whether one that requires a gradient is refused; None where autograd is on.
-    """
-    if seen_by_others():
-        return False
-    recorded = torch.is_grad_enabled() if recorded is None else recorded
-    for leaf in leaves:
-        tensor = leaf.tensor if type(leaf) is Shared else leaf
-        if not readable(tensor, recorded):
-            return False
-        if not tensor.is_cpu:
-            return _one_device(leaves, recorded)
-    return processor
-
-
-def served(leaves: Sequence[Any]) -> Where:
-    """Return where plain tensors are, as `ordinary`, also where a derivative is wanted."""
-    return ordinary(leaves, recorded=False)
-
-
-def _one_device(leaves: Sequence[Any], recorded: bool) -> Where:
-    """Return the CUDA device where plain tensors are, single numbers aside; False where there is none."""
-    found = set[torch.device]()
-    for leaf in leaves:
-        tensor = plain(leaf)
-        if not readable(tensor, recorded):
-            return False
-        if tensor.dim() or not tensor.is_cpu:
-            found.add(tensor.device)
-    where = found.pop()
-    return where if not found and where.type == "cuda" else False
-
-
-def seen_by_others() -> bool:
-    """Return whether a tracer, a transform of torch.func or forward mode looks at the operations."""
-    return _transforms() is not None or forward_ad._current_level >= 0 or _modes() > 0
-
-
-def transformed() -> bool:
-    """Return whether a transform of torch.func or forward mode looks at the operations."""
-    return _transforms() is not None or forward_ad._current_level >= 0
-
-
-def say_transformed(name: str) -> None:
-    """Log once that a transform keeps a program in plain torch, where one looks and nobody traces."""
-    if transformed() and not _modes():
-        say(
-            name,
-            "a transform of `torch.func` (vmap, jacrev, grad, ...) or forward mode is active",
-        )
-
-
-_TENSORS = (Tensor, torch.nn.Parameter)
-_transforms, _modes = torch._C._functorch.peek_interpreter_stack, torch._C._len_torch_dispatch_stack
-
-
-def at_once(x: Tensor) -> bool:
-    """Return `ordinary` of one tensor where the processor's lanes run it, and not on `device.host`."""
-    return readable(x, torch.is_grad_enabled()) and x.is_cpu and processor is True and not seen_by_others()
-
-
-def form(leaf: Any) -> Form:
-    """Return what a plan must know about an input."""
-    if type(leaf) is Tensor and leaf.is_cpu:  # most of all
-        return leaf.shape, leaf.stride(), leaf.dtype, False
-    tensor = plain(leaf)
-    shared = type(leaf) is Shared
-    place = shared if tensor.is_cpu else (shared, tensor.device)
-    return tensor.shape, tensor.stride(), tensor.dtype, place
 
 
 class PlannedCall:

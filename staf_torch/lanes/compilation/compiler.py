@@ -19,7 +19,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ...signs import Sign
-from ..threads.locks import Mutex
+from ..threads import Mutex
 from .cache import cache, found, publish, scratch, used
 
 COMPILERS = ("g++", "c++", "clang++")

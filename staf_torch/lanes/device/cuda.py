@@ -24,7 +24,7 @@ import torch
 from ...signs import Sign
 from ..compilation.cache import cache, found, publish, scratch, used
 from ..emit.cuda import FEWER_REGISTERS, KERNEL
-from ..threads.locks import Mutex
+from ..threads import Mutex
 
 _log = logging.getLogger(__name__)
 REMEDY = "install torch with CUDA, or `pip install staf-torch[cuda]`"

@@ -16,9 +16,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..calls import planned_call as call
+from ..calls import inputs
 from ..compilation.compiler import library
-from ..threads.locks import Mutex
+from ..threads import Mutex
 
 _FOLDER = Path(__file__).parent
 _OPTIONS = ("-O1", "-march=native", "-std=c++17", "-shared", "-fPIC", "-w", "-ffp-contract=off")
@@ -62,11 +62,11 @@ def host(memory: int = sys.maxsize) -> Iterator[None]:
         memory: bytes that the results of a call may take at once.
     """
     global _memory
-    before, call.processor, _memory = (call.processor, _memory), torch.device("cpu"), memory
+    before, inputs.processor, _memory = (inputs.processor, _memory), torch.device("cpu"), memory
     try:
         yield
     finally:
-        call.processor, _memory = before
+        inputs.processor, _memory = before
 
 
 @contextlib.contextmanager

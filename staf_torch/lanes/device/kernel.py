@@ -1,4 +1,4 @@
-"""Kernels of a program, and prepared calls of them: what `call.PlannedCall` is for the processor."""
+"""Kernels of a program, and prepared calls of them: what `planned_call.PlannedCall` is for the processor."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torch import Tensor
 from ..calls.planned_call import Compiled, entries_lie_evenly, inner_strides
 from ..emit.cuda import in_arguments
 from ..row_numbers import columns
-from ..threads.locks import Mutex
+from ..threads import Mutex
 from ..tree import Shared, plain
 from .chunks import Room, in_chunks
 from .cuda import CudaDevice

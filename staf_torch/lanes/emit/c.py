@@ -35,7 +35,7 @@ NO_NUMBERS = CTable()
 
 
 def random_numbers(lines: Sequence[str], real: str, qualifiers: str) -> list[str]:
-    """Return the functions of random numbers that statements call: `lanes.philox` in words of 32 bits."""
+    """Return the functions of random numbers that statements call: `trace.philox` in words of 32 bits."""
     suffix = "f" if real == "float" else ""
     if not any("philox_" in line for line in lines):
         return []

@@ -18,7 +18,7 @@ from torch._dynamo.symbolic_convert import InstructionTranslator
 from torch._dynamo.variables.base import AttributeMutationNew, ValueMutationNew
 from torch._subclasses import FakeTensor
 
-from ..calls.planned_call import transformed
+from ..calls.inputs import transformed
 from ..compiled_methods import CompiledMethod, bound_to
 from ..dependencies.contents import Contents
 from ..prepared_call import Prepared

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..calls.planned_call import seen_by_others
+from ..calls.inputs import seen_by_others
 
 _WORD, _HALF = 0xFFFFFFFF, 0xFFFF
 _FACTORS, _WEYL, ROUNDS = (0xD2511F53, 0xCD9E8D57), (0x9E3779B9, 0xBB67AE85), 10

@@ -19,8 +19,8 @@ import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
+from ..calls.choice import RepaysError
 from ..calls.inputs import Given
-from ..choice.plain_time import RepaysError
 from ..row_numbers import over_rows, some_rows
 from ..tree import Shared, Tree, flatten, plain, unflatten
 from .loops import few_passes

@@ -1,1 +1,0 @@
-"""The automatic choice between compiled code and plain torch."""

@@ -1,1 +1,0 @@
-"""Locks of objects that threads share, and small operations in one thread."""
