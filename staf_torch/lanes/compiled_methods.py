@@ -3,8 +3,8 @@
 A policy is asked ten times in a test and a hundred thousand times in a control loop. Its class says in one
 line that a method may be compiled, ``@compiled("a policy")``; the method stays plain torch, which is what it
 means. A program serves once the calls in plain torch have taken as long as a compiler, by their operations
-(`calls.choice.PlainTime`), and from the hundredth call on at the latest. It is made anew when anything that the owner
-holds has changed (`contents`), is no part of a pickle or a copy, and is out of the way where somebody traces
+(`PlainTime`), and from the hundredth call on at the latest. It is made anew when anything that the owner
+holds has changed (`Contents`), is no part of a pickle or a copy, and is out of the way where somebody traces
 or differentiates. To compile at construction would take seconds of every short test.
 """
 
@@ -33,7 +33,7 @@ from .threads import ENTRIES, Mutex, alone
 from .torch_compile.graph_operator import NAMED, spelled
 from .torch_compile.opaque import one_operator
 from .trace.loops import tracing_now
-from .tree import Shared, Tree, flatten, plain, unflatten
+from .tree import Shared, Tree, flatten, plain
 
 _PAYS = 100  # calls of a small batch in plain torch after which it is compiled, however short they are
 _SOON = 30  # calls
@@ -224,8 +224,7 @@ class CompiledMethod:
             self._compile(trees=bool(more))
             return self._learned(x, *more)
         if more:
-            leaves, structure = flatten(program((), (), (x, *more), steps=1)[1])
-            return unflatten(structure, iter([leaf[:, 0] for leaf in leaves]))
+            return program.once(x, *more)
         if not is_state(x):
             return self._refused(x)
         with points_of_rows(len(x), x.shape[1:-1].numel()) if x.dim() > 2 else contextlib.nullcontext():

@@ -28,7 +28,7 @@ from .trace.row_independence import doubt, undrawn
 from .trace.step import Step, trace
 from .trace.step_copy import NoReverseError
 from .trace.tracer import NotLoweredError
-from .tree import Shared, Tree, flatten, plain, unflatten
+from .tree import Shared, Tree, flatten, mapped, plain, unflatten
 
 Some = TypeVar("Some", bound=Tensor)
 _FEW = 8  # rows that one vector holds
@@ -142,7 +142,8 @@ class Program(Derived):
         Returns:
             The carry, (B, ...), and the outputs, (B, ceil(T / every), ...).
         """
-        if tracing_now() and every == 1 and _loops_over(now):  # within a program that is traced
+        times = flatten(now)[0] if tracing_now() and every == 1 else ()
+        if times and not any(isinstance(leaf, Shared) for leaf in times):  # within a program that is traced
             return scan(lambda carry, now: self.step(carry, now, row), carry, now)
         if not self.compile:  # nothing to prepare or to watch
             return self.definition(carry, now, row, steps=steps, every=whole("every", every, 1))
@@ -176,8 +177,11 @@ class Program(Derived):
         spread = [part.unsqueeze(1).expand(*shape, *part.shape[1:]) for part in fixed]
         rows = tuple(part.flatten(0, 1) for part in (*spread, *points))
         with points_of_rows(*shape):
-            leaves, structure = flatten(self((), (), rows, steps=1)[1])
-        return unflatten(structure, iter([leaf[:, 0].unflatten(0, shape) for leaf in leaves]))
+            return mapped(lambda leaf: leaf.unflatten(0, shape), self.once(*rows))
+
+    def once(self, *row: Tree) -> Tree:
+        """The outputs of one step without a carry, (B, ...)."""
+        return mapped(lambda leaf: leaf[:, 0], self((), (), row, steps=1)[1])
 
     def prepare(
         self, carry: Tree, now: Tree = (), row: Tree = (), *, steps: int | None = None, every: int = 1
@@ -438,12 +442,6 @@ class Program(Derived):
         if self._read is not None:
             self._read.warn(self.name)
         return Built.of(made, call, given)
-
-
-def _loops_over(now: Tree) -> bool:
-    """Return whether there are times, in tensors of which every row has its own."""
-    leaves = flatten(now)[0]
-    return bool(leaves) and not any(isinstance(leaf, Shared) for leaf in leaves)
 
 
 _REQUIRES = operator.attrgetter("requires_grad")

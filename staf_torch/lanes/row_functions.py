@@ -13,7 +13,7 @@ from .prepared_call import Plan
 from .program import Program
 from .shared_programs import shared_program
 from .trace.step import Step
-from .tree import Tree, flatten, unflatten
+from .tree import Tree
 
 _KEPT = 64  # shapes of calls that are remembered
 
@@ -107,5 +107,4 @@ class Trees:
 
     def __call__(self, *given: Tree) -> Tree:
         self.compiled = self.compiled or self.program.compiles((), (), given, steps=1)
-        leaves, structure = flatten(self.program((), (), given, steps=1)[1])
-        return unflatten(structure, iter([leaf[:, 0] for leaf in leaves]))
+        return self.program.once(*given)

@@ -1,4 +1,9 @@
-"""Programs of which many differ in tensors alone: traced once, or never where the cache knows them."""
+"""Programs of which many differ in tensors alone: traced once, or never where the cache knows them.
+
+What a step reads is written down as a key without floating-point tensors (`Contents`). A step of an equal key
+takes over the text of the first, with a table of its own tensors' numbers. To look a program up by its class
+and arguments would miss what a user's functions read beside.
+"""
 
 from __future__ import annotations
 

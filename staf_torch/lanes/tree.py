@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from typing import Any
 
 from torch import Tensor
@@ -33,6 +33,13 @@ def unflatten(structure: Any, leaves: Iterator[Any]) -> Any:
     if kind is tuple:
         return tuple(values)
     return kind(*values) if hasattr(kind, "_fields") else kind(values)
+
+
+def mapped(function: Callable[..., Any], tree: Any, *others: Any) -> Any:
+    """The tree of function(leaf, ...): of every leaf, and of those of other trees in its place."""
+    leaves, structure = flatten(tree)
+    columns = leaves, *(flatten(other)[0] for other in others)
+    return unflatten(structure, iter([function(*each) for each in zip(*columns, strict=True)]))
 
 
 def _structure(tree: Any, leaves: list[Any]) -> Hashable:
@@ -107,6 +114,4 @@ def plain(leaf: Any) -> Tensor:
 
 def moved(tree: Any, device: str) -> Any:
     """The tree with its tensors on a device."""
-    leaves, structure = flatten(tree)
-    to = (Shared(x.tensor.to(device)) if isinstance(x, Shared) else x.to(device) for x in leaves)
-    return unflatten(structure, to)
+    return mapped(lambda x: Shared(x.tensor.to(device)) if isinstance(x, Shared) else x.to(device), tree)

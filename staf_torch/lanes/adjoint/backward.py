@@ -34,7 +34,7 @@ _ROWS = 32  # that the adjoint takes at once, at most
 
 
 class _Sum(NamedTuple):
-    """What slopes are summed over times by: its form in a row, and whether all rows share it."""
+    """A quantity by which slopes are summed over times: its form in a row, and whether all rows share it."""
 
     shape: torch.Size
     dtype: torch.dtype
@@ -42,7 +42,7 @@ class _Sum(NamedTuple):
 
 
 class _Adjoint(NamedTuple):
-    """What is found out once of the adjoint of a program, whatever numbers its tensors have.
+    """Facts on the adjoint of a program that do not depend on the numbers of its tensors.
 
     Args:
         trace: of the program that keeps carries, by which it is known.
@@ -175,7 +175,7 @@ class Backward:
         return program.built(given)
 
     def _deciding(self) -> Deciding:
-        """What the adjoint depends on."""
+        """Return what the adjoint depends on."""
         ends, outputs = ([end is not None for end in each] for each in (self._end, self._ends))
         try:
             own = [x[0].detach().requires_grad_(x.is_floating_point()) for x in self._own]
@@ -229,11 +229,7 @@ class Backward:
         carried = [joined(parts) for parts in zip(*slopes, strict=True)]
         places = [k for k, decides in enumerate(self._adjoint.form.carry) if decides]
         self.slopes = [*zip(places, carried, strict=True)]
-        return self._sorted(
-            carried,
-            [joined(parts) for parts in zip(*sums, strict=True)],
-            at_times.joined(),
-        )
+        return self._sorted(carried, [joined(parts) for parts in zip(*sums, strict=True)], at_times.joined())
 
     def _of_units(self, total: Sequence[Tensor]) -> list[Tensor]:
         """Return the sums of some rows: of each, and as one tensor, by 64 rows, those that all rows share."""
@@ -260,7 +256,8 @@ class Backward:
         carry = [x if need else None for x, need in zip(each, self._of_carry, strict=True)]
         of_captured = iter(self._by_captured(totals))
         captured = [next(of_captured) if k in self._of_captured else None for k in range(len(self._captured))]
-        return [*row, *now, *carry, *captured, *self._numbers(totals)]
+        own = [next(totals) if k in self._of_own else None for k in range(len(self._own))]
+        return [*row, *now, *carry, *captured, *own]
 
     def _by_captured(self, totals: Iterator[Tensor]) -> list[Tensor]:
         """Gradients by captured tensors, through the numbers of the table that follow from them."""
@@ -269,9 +266,6 @@ class Backward:
             return [next(totals) for _ in self._of_captured]
         found: list[Tensor] = table(self._ran.read, [next(totals) for _ in table.runs])
         return found
-
-    def _numbers(self, totals: Any) -> list[Tensor | None]:
-        return [next(totals) if k in self._of_own else None for k in range(len(self._own))]
 
     def _blocks(self, kept: bool) -> tuple[int, int]:
         """Return how many rows, and how many times of theirs, are taken at once."""

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..calls.planned_call import Compiled, fresh, inner_strides
+from ..calls.planned_call import Compiled, fresh, rows_innermost
 from ..trace.graph import Graph, Sizes
 from ..trace_files import Trace
 from .row_sums import empty_rows
@@ -83,7 +83,7 @@ class Rooms(NamedTuple):
 
 
 class Keeping:
-    """What makes the tensors of calls that keep the carry, on the processor.
+    """Recipe of the tensors of calls that keep the carry, on the processor.
 
     Args:
         compiled: the program: its outputs are the results, or these and the carry before a step.
@@ -98,7 +98,7 @@ class Keeping:
     ) -> None:
         rows, times = sizes
         self._like, self._rows, self._times = torch.empty(0, dtype=compiled.real, device="cpu"), rows, times
-        self._ends = [((rows, *shape), (1, *inner_strides(shape, rows))) for shape, _ in compiled.carry]
+        self._ends = [rows_innermost(rows, (), shape) for shape, _ in compiled.carry]
         places = [where if k in keeps else (NOWHERE, 0) for k, where in enumerate(trace.carried)]
         late = {j for where, j in places if where == AFTER}
         self._read = sorted({j for where, j in places if where not in (SAME, NOWHERE)})
@@ -109,11 +109,10 @@ class Keeping:
         ]()  # numbers, offset, shape, strides
         self._unwanted = dict[int, Tensor]()
         for j, (shape, _) in enumerate(compiled.outputs):
-            size = shape.numel() * rows
-            strides = 1, size, *inner_strides(shape, rows)
             if j < results or j in self._read:
+                size = shape.numel() * rows
                 more = size * (j in late)
-                self._made[j] = size * times + more, more, (rows, times, *shape), strides
+                self._made[j] = size * times + more, more, *rows_innermost(rows, (times,), shape)
             else:
                 self._unwanted[j] = self._like.new_empty((0, times, *shape))
         self._results = len(compiled.carry) + results
@@ -122,8 +121,7 @@ class Keeping:
             if where in (SAME, NOWHERE):
                 self._before.append(self._like.new_zeros(()).expand(rows, times, *shape))
             else:
-                strides = 1, shape.numel() * rows, *inner_strides(shape, rows)
-                self._before.append((j, (rows, times, *shape), strides))
+                self._before.append((j, *rows_innermost(rows, (times,), shape)))
 
     def __call__(self, carry: Sequence[Tensor]) -> Rooms:
         """Return new tensors for a call.

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..calls.planned_call import fresh, inner_strides
+from ..calls.planned_call import fresh, rows_innermost
 from ..tree import Shared
 
 UNIT = 64
@@ -65,8 +65,7 @@ class AtTimes:
 def empty_rows(like: Tensor, rows: int, times: tuple[int, ...], shape: Sequence[int]) -> Tensor:
     """Return an empty tensor (rows, *times, *shape) in whose memory the rows are innermost."""
     size = torch.Size(shape).numel() * rows
-    strides = (1, *[size for _ in times], *inner_strides(shape, rows))
-    return fresh(like, *times, size).as_strided((rows, *times, *shape), strides)
+    return fresh(like, *times, size).as_strided(*rows_innermost(rows, times, shape))
 
 
 def by_units(x: Tensor) -> Tensor:

@@ -1,4 +1,10 @@
-"""Calls of a compiled program for inputs of fixed shapes: nothing is found out twice."""
+"""Calls of a compiled program for inputs of fixed shapes: nothing is found out twice.
+
+Machine code is given addresses and strides, so that inputs are read where they lie. The strides of a form are
+found once and stand in a record; a call packs the addresses of its tensors, makes the tensors of the results,
+rows innermost, and enters the code: some microseconds beside the arithmetic. An input of another dtype, or
+whose entries do not lie evenly, is copied first.
+"""
 
 from __future__ import annotations
 
@@ -117,27 +123,23 @@ class PlannedCall:
         if compiled.rows:
             leaves, times = self._with_columns(leaves), [*[False] * len(compiled.rows), *times]
         self._copied: list[int] = []  # inputs of another dtype, or without one stride from entry to entry
-        slots = [
-            self._input(k, leaf, timed) for k, (leaf, timed) in enumerate(zip(leaves, times, strict=True))
-        ]
+        slots = list[_Slot]()
+        for k, (leaf, timed) in enumerate(zip(leaves, times, strict=True)):
+            laid, lies = strides_of(leaf, timed, plain(leaf).dtype == compiled.real)
+            slots.append(_Slot(*laid))
+            self._copied += [] if lies else [k]
         self.direct = not self._copied and not any(type(leaf) is Shared for leaf in leaves)
         recorded = -(-steps // every)
-        ends = [((rows, *s), (1, *inner_strides(s, rows)), s.numel(), 0) for s, _ in compiled.carry]
+        ends = [(*rows_innermost(rows, (), s), s.numel(), 0) for s, _ in compiled.carry]
         histories = [
-            (
-                (rows, recorded, *s),
-                (1, s.numel() * rows, *inner_strides(s, rows)),
-                s.numel(),
-                s.numel() * rows,
-            )
-            for s, _ in compiled.outputs
+            (*rows_innermost(rows, (recorded,), s), s.numel(), s.numel() * rows) for s, _ in compiled.outputs
         ]
         if rooms:
             strides = [room.stride() for room in rooms]
-            timed = [*[False] * len(ends), *[True] * len(histories)]
+            kinds = [*[False] * len(ends), *[True] * len(histories)]
             slots += [
                 _Slot(1, s[1] if at_times else 0, s[-1] if len(s) > 1 + at_times else 1, end[2])
-                for s, at_times, end in zip(strides, timed, (*ends, *histories), strict=True)
+                for s, at_times, end in zip(strides, kinds, (*ends, *histories), strict=True)
             ]
         else:
             slots += [_Slot(1, time, rows, entries) for _, _, entries, time in (*ends, *histories)]
@@ -194,18 +196,6 @@ class PlannedCall:
             late.append(((steps if k < inputs else recorded) - 1) * slot.time * size)
             slot.time = -slot.time
         return late
-
-    def _input(self, k: int, leaf: Any, timed: bool) -> _Slot:
-        shared, tensor = type(leaf) is Shared, plain(leaf)
-        lead = 1 + timed - shared
-        inner = tensor.shape[lead:]
-        strides = tensor.stride()
-        if tensor.dtype != self._compiled.real or not entries_lie_evenly(inner, strides[lead:]):
-            self._copied.append(k)
-            strides = inner_strides(tensor.shape, 1)
-        row = 0 if shared else strides[0]
-        longer = [stride for size, stride in zip(inner, strides[lead:], strict=True) if size > 1]
-        return _Slot(row, strides[lead - 1] if timed else 0, longer[-1] if longer else 1, inner.numel())
 
     def __call__(self, leaves: Sequence[Any]) -> list[Tensor]:
         """Return the carry after the last step and the outputs, all new.
@@ -298,10 +288,33 @@ def inner_strides(shape: Sequence[int], unit: int) -> tuple[int, ...]:
     return tuple(reversed(strides))
 
 
-def entries_lie_evenly(shape: Sequence[int], strides: Sequence[int]) -> bool:
-    """Return whether entries in their order lie equally far apart."""
-    longer = [(size, stride) for size, stride in zip(shape, strides, strict=True) if size > 1]
-    return all(a[1] == b[0] * b[1] for a, b in itertools.pairwise(longer))
+def rows_innermost(
+    rows: int, times: tuple[int, ...], shape: Sequence[int]
+) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """The shape (rows, *times, *shape) and strides of a tensor in whose memory the rows are innermost."""
+    size = torch.Size(shape).numel() * rows
+    return (rows, *times, *shape), (1, *[size for _ in times], *inner_strides(shape, rows))
+
+
+def strides_of(leaf: Any, timed: bool, lies: bool = True) -> tuple[tuple[int, int, int, int], bool]:
+    """The strides of an input from row to row, from time to time and from entry to entry, how many entries
+    there are, and whether it is read where it lies: if not, these are those of a contiguous copy.
+
+    Args:
+        leaf: a tensor or a `Shared` one.
+        timed: whether a dimension of times comes first (after the rows).
+        lies: whether it may be read where it lies if its entries lie equally far apart, in their order.
+    """
+    shared, tensor = type(leaf) is Shared, plain(leaf)
+    lead = 1 + timed - shared
+    inner, strides = tensor.shape[lead:], tensor.stride()
+    longer = [(n, stride) for n, stride in zip(inner, strides[lead:], strict=True) if n > 1]
+    lies = lies and all(a[1] == b[0] * b[1] for a, b in itertools.pairwise(longer))
+    if not lies:
+        strides = inner_strides(tensor.shape, 1)
+        longer = [(n, stride) for n, stride in zip(inner, strides[lead:], strict=True) if n > 1]
+    row, time, entry = 0 if shared else strides[0], strides[lead - 1] if timed else 0, longer[-1:]
+    return (row, time, entry[0][1] if entry else 1, inner.numel()), lies
 
 
 @functools.cache

@@ -29,7 +29,7 @@ def version(tensor: Tensor) -> int:
 
 
 class Writes:
-    """How tensors are now, to be compared later.
+    """The state of tensors now, to be compared later.
 
     Torch counts writes to a tensor, but none to ``tensor.data`` (``target.data.copy_(...)``) or by NumPy,
     nor that ``tensor.data = other`` gives it other memory, as `torch.nn.utils.vector_to_parameters` does. So

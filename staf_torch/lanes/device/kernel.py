@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from ..calls.planned_call import Compiled, entries_lie_evenly, inner_strides
+from ..calls.planned_call import Compiled, rows_innermost, strides_of
 from ..emit.cuda import in_arguments
 from ..row_numbers import columns
 from ..threads import Mutex
@@ -110,18 +110,21 @@ class DeviceCall:
         leaves = self._with_columns(leaves)
         times = [*times[:once], *[False] * len(compiled.rows), *times[once:]]
         self._copied: list[int] = []  # inputs without one stride from entry to entry, or from elsewhere
-        read = [self._input(k, *given) for k, given in enumerate(zip(leaves, times, strict=True))]
+        read = list[tuple[int, ...]]()
+        for k, (leaf, timed) in enumerate(zip(leaves, times, strict=True)):
+            tensor = plain(leaf)
+            strides, lies = strides_of(leaf, timed, tensor.device == where and tensor.dim() > 0)
+            read.append(strides)
+            self._copied += [] if lies else [k]
         self._late = [(steps - 1) * time for _, time, *_ in read] if backwards else None
         if backwards:
             read = [(row, -time, *entries) for row, time, *entries in read]
         self.direct = not self._copied and not any(type(leaf) is Shared for leaf in leaves)
         recorded = -(-steps // every)
         self._rooms: list[Room | None] = [
-            Room((rows, *s), (1, *inner_strides(s, rows)), dtype) for s, dtype in compiled.carry
+            *(Room(*rows_innermost(rows, (), s), dtype) for s, dtype in compiled.carry),
+            *(Room(*rows_innermost(rows, (recorded,), s), dtype) for s, dtype in compiled.outputs),
         ]
-        for s, dtype in compiled.outputs:
-            strides = 1, s.numel() * rows, *inner_strides(s, rows)
-            self._rooms.append(Room((rows, recorded, *s), strides, dtype))
         most = max([s.numel() for s, _ in (*compiled.carry, *compiled.outputs)], default=1)
         reach = max([abs(entry) * entries for *_, entry, entries in read], default=0)
         wide = max(rows * (recorded + 1) * most, reach) > _MOST
@@ -151,18 +154,6 @@ class DeviceCall:
         whole.pack_into(self._record, 0, *[0] * pointers, *numbers, *strides, rows, steps, every)
         self._pack = struct.Struct(f"{pointers}P").pack_into
         self._lock = Mutex()
-
-    def _input(self, k: int, leaf: Any, timed: bool) -> tuple[int, ...]:
-        """Strides from row to row, from time to time and from entry to entry, and how many entries."""
-        shared, tensor = type(leaf) is Shared, plain(leaf)
-        lead = 1 + timed - shared
-        inner, strides = tensor.shape[lead:], tensor.stride()
-        if tensor.device != self._where or tensor.dim() == 0 or not entries_lie_evenly(inner, strides[lead:]):
-            self._copied.append(k)
-            strides = inner_strides(tensor.shape, 1)
-        longer = [stride for size, stride in zip(inner, strides[lead:], strict=True) if size > 1]
-        row, time = 0 if shared else strides[0], strides[lead - 1] if timed else 0
-        return row, time, longer[-1] if longer else 1, inner.numel()
 
     def __call__(self, leaves: Sequence[Any]) -> list[Tensor]:
         """Return the carry after the last step and the outputs, all new, on the device's current stream.

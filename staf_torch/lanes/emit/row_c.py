@@ -254,7 +254,7 @@ def _address(tensor: Tensor) -> int:
 
 
 def _parts(name: str, value: Any) -> Iterator[tuple[str, Any]]:
-    """What an object leads to, by names."""
+    """Yield what an object leads to, by names."""
     dot = f"{name}." if name else ""
     if isinstance(value, list | tuple):
         fields = getattr(value, "_fields", None)

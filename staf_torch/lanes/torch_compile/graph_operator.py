@@ -263,7 +263,7 @@ class _TicketMemory(bytearray):
 
 
 class Surroundings:
-    """Whether torch records, casts or transforms operations: as where a graph was read.
+    """The modes of torch, whether it records, casts or transforms operations, where a graph was read.
 
     Args:
         recorded: whether autograd is on.

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import _disable_current_modes
 
-from ..tree import Tree, flatten, unflatten
+from ..tree import Tree, flatten, mapped, unflatten
 from .graph import FLAG, STEP, Ids, Loop
 from .tracer import LARGE, NotLoweredError, Tracer
 
@@ -82,10 +82,11 @@ def _passes(count: int) -> int:
 
 def _chosen(going: Tensor, after: Tree, before: Tree) -> Tree:
     """``after`` in the rows that go on, ``before`` in the others."""
-    (new, structure), old = flatten(after), flatten(before)[0]
-    masks = (going.reshape(going.shape + (1,) * (leaf.dim() - going.dim())) for leaf in new)
-    picked = [torch.where(mask, one, other) for mask, one, other in zip(masks, new, old, strict=True)]
-    return unflatten(structure, iter(picked))
+
+    def chosen(new: Tensor, old: Tensor) -> Tensor:
+        return torch.where(going.reshape(going.shape + (1,) * (new.dim() - going.dim())), new, old)
+
+    return mapped(chosen, after, before)
 
 
 def repeat_counted(most: int, count: Tensor, body: Callable[[Tree], Tree], start: Tree) -> Tree:
@@ -135,10 +136,8 @@ def where_rows(where: Tensor, body: Callable[[Tree], Some], given: Tree, otherwi
     rows = where.nonzero().squeeze(1)
     if not len(rows):
         return otherwise
-    (leaves, structure), (others, shape) = flatten(given), flatten(otherwise)
-    found = flatten(body(unflatten(structure, iter([leaf[rows] for leaf in leaves]))))[0]
-    pairs = zip(others, found, strict=True)
-    some: Some = unflatten(shape, iter([old.index_copy(0, rows, new) for old, new in pairs]))
+    found = body(mapped(lambda leaf: leaf[rows], given))
+    some: Some = mapped(lambda old, new: old.index_copy(0, rows, new), otherwise, found)
     return some
 
 
@@ -174,7 +173,7 @@ def scan(
     count = leaves[0].shape[dim]
     tracer = None if unrolled or count < 2 else tracer_of((carry, inputs))
     if tracer is not None:
-        first = unflatten(structure, iter([leaf.select(dim, 0) for leaf in leaves]))
+        first = mapped(lambda leaf: leaf.select(dim, 0), inputs)
         if not _fixed(tracer, (carry, inputs), lambda: body(carry, first)):
             return _loop(tracer, count, body, carry, inputs, dim)
     outputs, shape = [], None
@@ -212,21 +211,19 @@ def reduce(
         operation: over the points.
         dim: of the points, counted from the front.
     """
-    leaves, structure = flatten(points)
-    count = leaves[0].shape[dim]
+    count = flatten(points)[0][0].shape[dim]
     if count > 1 and (tracer := tracer_of(points)) is not None:
-        begin = unflatten(structure, iter([leaf.narrow(dim, 0, 1) for leaf in leaves]))
-        first = _reduced(body(begin), operation, dim)
+        first = _reduced(body(mapped(lambda leaf: leaf.narrow(dim, 0, 1), points)), operation, dim)
 
         def step(carry: Tensor, now: Tree) -> tuple[Tensor, tuple[()]]:
-            one = _reduced(body(_unsqueezed(now, dim)), operation, dim)
+            one = _reduced(body(mapped(lambda leaf: leaf.unsqueeze(dim), now)), operation, dim)
             return _COMBINE[operation](carry, one), ()
 
-        rest = unflatten(structure, iter([leaf.narrow(dim, 1, count - 1) for leaf in leaves]))
         if count > 2:
+            rest = mapped(lambda leaf: leaf.narrow(dim, 1, count - 1), points)
             total: Tensor = _loop(tracer, count - 1, step, first, rest, dim)[0]
             return total
-        return step(first, unflatten(structure, iter([leaf.select(dim, 1) for leaf in leaves])))[0]
+        return step(first, mapped(lambda leaf: leaf.select(dim, 1), points))[0]
     return _reduced(body(points), operation, dim)
 
 
@@ -264,11 +261,6 @@ _COMBINE: dict[str, Callable[..., Tensor]] = {"sum": torch.add, "max": torch.max
 
 def _reduced(values: Tensor, operation: str, dim: int) -> Tensor:
     return values.sum(dim) if operation == "sum" else getattr(values, f"a{operation}")(dim)
-
-
-def _unsqueezed(tree: Tree, dim: int) -> Tree:
-    leaves, structure = flatten(tree)
-    return unflatten(structure, iter([leaf.unsqueeze(dim) for leaf in leaves]))
 
 
 @contextmanager

@@ -22,7 +22,7 @@ from torch.overrides import TorchFunctionMode
 from ..calls.choice import RepaysError
 from ..calls.inputs import Given
 from ..row_numbers import over_rows, some_rows
-from ..tree import Shared, Tree, flatten, plain, unflatten
+from ..tree import Shared, Tree, flatten, mapped, plain
 from .loops import few_passes
 
 _BITS = (1, -1, 3, -5, 17)  # units in the last place by which inputs are moved
@@ -230,8 +230,7 @@ def _called(
     )
 
     def plainly(*given: Tree) -> Tree:
-        leaves, structure = flatten(given)
-        return step(*unflatten(structure, iter([plain(leaf) for leaf in leaves])))
+        return step(*mapped(plain, given))
 
     with few_passes(), some_rows(torch.tensor(rows, dtype=torch.int64, device="cpu")):
         return flatten(over_rows(plainly, carry, now, row))[0]
