@@ -8,7 +8,6 @@ requires one. These are taken as numbers, and what is computed with them refuses
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
 import inspect
@@ -21,7 +20,7 @@ import torch
 from torch import Tensor
 
 from .dependencies.contents import ATOMS, BOUND, IDLE, Derived, Walk
-from .dependencies.lookups import is_users
+from .dependencies.lookups import content_of, is_users
 from .tree import flatten, unflatten
 
 _P = ParamSpec("_P")
@@ -174,10 +173,9 @@ def _surely_none(value: Any, seen: dict[int, Any]) -> bool:
     elif isinstance(value, MethodType):
         parts = value.__self__, value.__func__
     elif isinstance(value, FunctionType):
-        cells = value.__closure__ or ()
         if is_users(value) or vars(value):
             return False
-        parts = (value.__defaults__, *(cell.cell_contents for cell in cells))
+        parts = (value.__defaults__, *map(content_of, value.__closure__ or ()))
     elif isinstance(value, type):
         return not is_users(value)
     elif hasattr(value, "__dict__") and not isinstance(value, Derived) and not is_users(kind):
@@ -196,10 +194,7 @@ def _inside(value: Any) -> list[Any]:
         return [*value.values()]
     if isinstance(value, list | tuple | set):
         return [*value]
-    closed: list[Any] = []
-    for cell in getattr(value, "__closure__", None) or ():
-        with contextlib.suppress(ValueError):  # of a name without a value yet
-            closed.append(cell.cell_contents)
+    closed = map(content_of, getattr(value, "__closure__", None) or ())
     return [*closed, getattr(value, "__self__", None), *getattr(value, "__dict__", {}).values()]
 
 

@@ -228,15 +228,7 @@ def number(place: int, value: float) -> Tensor:
     return torch.tensor(value, dtype=torch.float64, device="cpu")
 
 
-class _DtypeNames(dict[torch.dtype, str]):
-    """Names of dtypes, which torch spells anew each time."""
-
-    def __missing__(self, dtype: torch.dtype) -> str:
-        self[dtype] = name = str(dtype)
-        return name
-
-
-_NAMES = _DtypeNames()
+_name_of = functools.cache(str)  # of a dtype, which torch spells anew each time
 
 
 class _Same:
@@ -412,7 +404,7 @@ class Walk(pickle.Pickler):
         place = self._places[id(value)]
         own = isinstance(value, RowNumbers)  # how many rows there are is no matter
         where = "cpu" if value.is_cpu else str(value.device)
-        return place, own, _NAMES[value.dtype], where, tuple(value.shape), value.stride()
+        return place, own, _name_of(value.dtype), where, tuple(value.shape), value.stride()
 
     def _note(self, value: Any) -> None:
         """Note what may change inside of an object; a module is noted in `reducer_override`."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 import functools
 import logging
 from collections.abc import Callable
-from types import CellType, FunctionType, MethodType, ModuleType
+from types import FunctionType, MethodType, ModuleType
 from typing import Any, NamedTuple, TypeVar
 
 import torch
@@ -20,6 +20,7 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
 from ..dependencies.contents import BOUND, Derived
+from ..dependencies.lookups import EMPTY, content_of
 from ..row_numbers import RowNumbers, all_rows, column_of, resolving
 from .each_row import in_row, spread_rows, tried, turn_of
 
@@ -348,7 +349,9 @@ def changed(value: Any, change: Callable[[Any], Any], known: dict[int, Any] | No
             known[id(value)] = type(value)(*parts) if hasattr(value, "_fields") else type(value)(parts)
     elif isinstance(value, FunctionType):
         for cell in value.__closure__ or ():
-            _change_cell(cell, inside)
+            content = content_of(cell)
+            if content is not EMPTY and (new := inside(content)) is not content:
+                cell.cell_contents = new
         value.__defaults__ = inside(value.__defaults__)
         inside(value.__kwdefaults__)
     elif isinstance(value, MethodType):
@@ -373,13 +376,3 @@ def _change_dict(value: dict[Any, Any], inside: Callable[[Any], Any]) -> None:
         new = inside(value[key])
         if new is not value[key]:
             value[key] = new
-
-
-def _change_cell(cell: CellType, inside: Callable[[Any], Any]) -> None:
-    try:
-        content = cell.cell_contents
-    except ValueError:  # empty as yet
-        return
-    new = inside(content)
-    if new is not content:
-        cell.cell_contents = new

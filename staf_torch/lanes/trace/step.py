@@ -111,7 +111,7 @@ def trace(
             after, out = _taken(step, given.tree("carry", carry), now, row)
         ends, structure = flatten(after)
         if structure != given.structures["carry"] or _forms(ends) != _forms(carry):
-            raise NotLoweredError(_other_carry("the step returns", ends, carry))
+            raise NotLoweredError(_other_carry(ends, carry))
         leaves, shape = flatten(out)
         _refuse_outputs(ends, leaves)
         following = [node for end in ends for node in tracer.nodes(end).ravel().tolist()]
@@ -190,16 +190,10 @@ def _refuse_outputs(ends: Sequence[Any], leaves: Sequence[Any]) -> None:
         raise NotLoweredError("an output of the step has no dimension of rows")
 
 
-def _other_carry(who: str, found: Sequence[Tensor], given: Sequence[Tensor]) -> str:
-    pairs = [
-        (after, before) for after, before in zip(found, given, strict=False) if not _alike(after, before)
-    ]
-    told = [f"{tuple(b.shape)} {b.dtype} became {tuple(a.shape)} {a.dtype}" for a, b in pairs[:1]]
-    return f"{who} a carry of other shapes or dtypes than it was given{': ' if told else ''}{''.join(told)}"
-
-
-def _alike(one: Tensor, other: Tensor) -> bool:
-    return one.shape == other.shape and one.dtype == other.dtype
+def _other_carry(found: Sequence[Tensor], given: Sequence[Tensor]) -> str:
+    pairs = (pair for pair in zip(_forms(found), _forms(given), strict=False) if pair[0] != pair[1])
+    told = [f": {tuple(b[0])} {b[1]} became {tuple(a[0])} {a[1]}" for a, b in pairs]
+    return f"the step returns a carry of other shapes or dtypes than it was given{''.join(told[:1])}"
 
 
 def _entries(leaf: Any, skip: int) -> int:
