@@ -67,7 +67,6 @@ def _several(model: Any, k: int) -> Tensor:
 
 OBJECTS = {
     "filter": Crowded(lambda: _fitted(st.StaFRegressor(radius=0.3)), _told, _taught),
-    "filter with units": Crowded(lambda: _fitted(st.StaFRegressor(scaling=True)), _told, _taught),
     "filter of an angle": Crowded(lambda: _fitted(st.StaFRegressor(periodic=[0])), _told, _taught),
     "filter at points": Crowded(lambda: _fitted(st.StaFRegressor(radius=0.3)), _several, _taught),
     "mixture": Crowded(lambda: _fitted(MixtureRegressor(128, 8)), _told, _taught),

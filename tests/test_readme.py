@@ -9,6 +9,7 @@ named beside it (`python -m tests.benchmarks PART`), it is a row of that part, t
 from __future__ import annotations
 
 import importlib.util
+import itertools
 import json
 import re
 import shlex
@@ -219,8 +220,9 @@ def jobs(words: list[str]) -> list[list[str]]:
         if not override.is_sweep_override():
             values.append([word])
         elif override.is_discrete_sweep():
-            swept = [f"{override.get_key_element()}={value}" for value in override.sweep_string_iterator()]
-            values.append(swept if (ROOT / "conf" / override.key_or_group).is_dir() else swept[:1])
+            count = None if (ROOT / "conf" / override.key_or_group).is_dir() else 1
+            swept = itertools.islice(override.sweep_string_iterator(), count)  # not a million seeds
+            values.append([f"{override.get_key_element()}={value}" for value in swept])
         else:
             values.append([f"{override.get_key_element()}={override.value().start}"])
     first = [choices[0] for choices in values]

@@ -406,8 +406,8 @@ ABSENT = {
     *("SafetyFilter.weight", "SafetyFilter.decay", "BoundedInputCost.bound", "PathIntegral.noise"),
 }
 """Arguments for which None has a meaning of its own."""
-NOT_ALONE = {("rings", "count"), ("SampledProblem", "dim"), ("StepPlant", "dim")}
-"""Arguments whose least value needs others beside it."""
+NOT_ALONE = {("rings", "count"), ("SampledProblem", "dim"), ("StepPlant", "dim"), ("report", "states")}
+"""Arguments whose least value needs others beside it, or takes seconds."""
 EVERY = tuple(rules())
 CALLS |= {
     name: make for name, make in VARIANTS.items() if name in {rule.call for rule in EVERY} - {*CALLS, *OTHERS}

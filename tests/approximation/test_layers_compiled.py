@@ -108,22 +108,17 @@ class ValueAndGradient(nn.Module):
         return self.staf.value_and_gradient(y)
 
 
-@pytest.mark.parametrize(
-    ("name", "strict"),
-    [("exponential", False), ("anchored_gaussian", False)],
-)
 @pytest.mark.filterwarnings("ignore::UserWarning")  # torch 2.6, of its own nodes
-def test_export_takes_batches_of_any_size(name: str, strict: bool) -> None:
-    count = 6 if name in ("exponential", "gaussian") else 3  # every step of a Newton basis is written out
-    staf = st.StaF(basis_of(name, count, 0.4)).fit_(uniform(2, low=0.3), Paper())
+def test_export_takes_batches_of_any_size() -> None:
+    staf = st.StaF(basis_of("exponential", 6, 0.4)).fit_(uniform(2, low=0.3), Paper())
     module = ValueAndGradient(staf)
     make = lambda *batch: staf.state + uniform(*batch, 2, low=-0.2, high=0.2)  # noqa: E731
     sizes = ({0: torch.export.Dim("batch"), 1: torch.export.Dim("points")},)
     with torch.no_grad():
-        program = torch.export.export(module, (make(3, 2),), dynamic_shapes=sizes, strict=strict)
+        program = torch.export.export(module, (make(3, 2),), dynamic_shapes=sizes, strict=False)
         for batch in ((3, 2), (7, 5)):
             y = make(*batch)
             for found, expected in zip(program.module()(y), module(y), strict=True):
                 torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
-    if name in ("exponential", "gaussian"):  # nothing that depends on the directions alone is left to do
-        assert "qr" not in program.graph_module.code
+    # nothing that depends on the directions alone is left to do
+    assert "qr" not in program.graph_module.code

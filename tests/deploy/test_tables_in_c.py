@@ -48,7 +48,7 @@ def learner(width: float, gain: float = 1.0) -> adp.ActorCritic:
 
 
 def walled(inertia: float, margin: float, low: float) -> adp.SafetyFilter:
-    plant = systems.Pendulum(mass=inertia)
+    plant = systems.Linear([[0.0, 1.0], [0.0, -inertia]], [[0.0], [1.0]])
     policy = adp.LQR(plant, COST)
     return adp.SafetyFilter(
         policy, plant, lambda x, t: 0.5 - x[:, 0], dt=0.1, low=low, high=3.0, margin=margin

@@ -14,7 +14,7 @@ from helpers_experiments import Ran, ran, run
 
 from staf_torch import adp, systems
 from staf_torch.experiments import adp_comparison
-from staf_torch.experiments.adp import LoopSolution, Regulation, count_the_restless, held_radius
+from staf_torch.experiments.adp import Regulation, count_the_restless, held_radius
 from staf_torch.settings.adp import adp_problem
 from staf_torch.signs import Progress
 
@@ -58,27 +58,6 @@ def test_a_closed_loop_has_its_cost_beside_the_optimum_and_a_history(
         assert history["time"].shape == (times,)
         for name in ("control", "actor_weights", "critic_weights", "running_cost"):
             assert history[name].shape[:2] == (batch, times)
-
-
-def test_alone_or_in_a_batch_a_closed_loop_has_the_same_metrics(tmp_path: Path) -> None:
-    members: list[tuple[str, ...]] = [
-        ("seed=3", "adp.critic=0.5"),
-        ("initial_state=[0.5,-0.5]", "adp.gains.critic=0.02", "adp.actor=0.2"),
-        ("dt=-1",),
-    ]
-    cfgs = [settings(*SHORT, "trajectories=2", *member) for member in members]
-    told: list[float] = []
-    *solved, wrong = Regulation().solve(cfgs, Progress(told.append))
-    assert told[-1] == 1
-    assert isinstance(wrong, ValueError)
-    for number, (cfg, solution) in enumerate(zip(cfgs, solved, strict=False)):
-        assert isinstance(solution, LoopSolution)
-        folder = tmp_path / str(number)
-        folder.mkdir()
-        alone = Regulation()(cfg, folder)
-        assert solution.metrics == pytest.approx(alone, rel=1e-9, abs=1e-12)
-    (alone_and_wrong,) = Regulation().solve([settings(*SHORT, "animation=mp4")], Progress(told.append))
-    assert "animation" in str(alone_and_wrong)
 
 
 @pytest.mark.parametrize(

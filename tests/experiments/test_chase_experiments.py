@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from composing import settings
-from helpers_experiments import CASES, ran, run
+from helpers_experiments import ran, run
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from torch import Tensor
@@ -88,20 +88,6 @@ def test_there_is_an_option_for_every_law_and_for_every_predictor() -> None:
     assert chase_problem(settings("optimizer=nesterov", "optimizer.inner_steps=3")).inner_steps == 3
 
 
-def test_single_precision_runs_every_law(tmp_path: Path) -> None:
-    few = (
-        "dtype=float32",
-        "dt=0.1",
-        "duration=1.0",
-        "settle_time=0.5",
-        "laws.work=2",
-        "laws.steps=[0.2,0.1]",
-    )
-    metrics = run(tmp_path, "experiment=laws", *few, "figures=false").metrics
-    assert all(value == 0 for name, value in metrics.items() if name.endswith("diverged_fraction"))
-    assert torch.get_default_dtype() == torch.float32
-
-
 def test_a_certified_chase_counts_its_violations() -> None:
     problem = chase_problem(settings(*SHORT, "predictor=tangent", "certificate=true"))
     plain = dataclasses.replace(problem, certificate=False)
@@ -133,34 +119,6 @@ def test_a_memory_of_a_run_that_never_settles_is_refused(wrong: str, tmp_path: P
         run(tmp_path, "experiment=memory", *words)
 
 
-def test_alone_or_in_a_batch_a_chase_has_the_same_metrics_history_and_figure(tmp_path: Path) -> None:
-    alone = ran("gradient_chase", "history=true")
-    cfgs = [
-        settings(*CASES["gradient_chase"].split(), "figures=true", "history=true", *more)
-        for more in ((), ("centers.radius=0.05",), ("seed=5",), ("dt=-1",))
-    ]
-    told: list[float] = []
-    first, other, seeded, wrong = GradientChase().solve(cfgs, Progress(told.append))
-    assert told[-1] == pytest.approx(1)
-    assert isinstance(wrong, ValueError)
-    assert isinstance(first, ChaseSolution)
-    assert isinstance(other, ChaseSolution)
-    assert isinstance(seeded, ChaseSolution)
-    for name, number in alone.metrics.items():
-        assert first.metrics[name] == pytest.approx(number, rel=1e-9, abs=1e-13), name
-    assert other.metrics["ultimate_error"] != first.metrics["ultimate_error"]
-    GradientChase().write(settings(*CASES["gradient_chase"].split(), "history=true"), tmp_path, first)
-    with np.load(alone.directory / "history.npz") as one, np.load(tmp_path / "history.npz") as two:
-        assert {*one} == {*two} >= {"time", *chase_batch.HISTORY}
-        for name in one:
-            np.testing.assert_allclose(one[name], two[name], rtol=1e-9, atol=1e-12)
-        assert one["state"].shape == (3, 21, 2)
-        np.testing.assert_allclose(one["time"], 0.05 * np.arange(21))
-        state, value, *_ = alone.figures[0].axes
-        np.testing.assert_array_equal(state.get_lines()[1].get_ydata(), one["state"][0, :, 1])
-        np.testing.assert_array_equal(value.get_lines()[1].get_ydata(), one["estimate"][0])
-
-
 def test_more_rows_than_go_through_time_together_change_nothing() -> None:
     """A run goes in blocks of 4096 rows; its history has the rows in their order."""
     few = ("dt=0.1", "duration=0.3", "settle_time=0.1", "trajectories=4100", "spread=0.4")
@@ -180,19 +138,6 @@ def test_more_rows_than_go_through_time_together_change_nothing() -> None:
     )
     for name, array in few_rows.drawn.items():
         np.testing.assert_allclose(blocks.drawn[name], array, rtol=1e-9, atol=1e-12)
-
-
-def test_a_long_trajectory_is_thinned_for_its_figure_as_if_it_came_in_one_piece() -> None:
-    problem = chase_problem(
-        settings("dt=0.001", "duration=4.01", "settle_time=0.1", "optimizer.inner_steps=1")
-    )
-    kept: list[Any] = []
-    (found,) = chase_batch.simulate([problem], [lambda pieces, row, time: kept.append(pieces)], [True])
-    assert len(kept) >= 20  # progress is seen
-    state = np.concatenate([piece["state"] for piece in kept], axis=1)[0]
-    assert state.shape[0] == 4011
-    np.testing.assert_array_equal(found.drawn["state"], state[::2])
-    np.testing.assert_allclose(found.drawn["time"], 0.002 * np.arange(2006))
 
 
 def far(start: str) -> ChaseProblem:

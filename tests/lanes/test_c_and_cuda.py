@@ -272,9 +272,7 @@ def test_kernels_compile_and_keep_their_numbers_in_registers(dtype: torch.dtype)
 
 
 KERNELS = {
-    "M = 3 SteepestDescent, 100": cases.weights(3, "SteepestDescent", 100),
     "M = 15 jacobi": cases.weights(15, "jacobi", 16),
-    "information actor-critic": cases.information,
 }
 
 

@@ -87,7 +87,7 @@ def test_threads_do_not_change_bits() -> None:
         PENDULUM(*inputs(20))
         assert len(os.listdir("/proc/self/task")) <= helping  # 20 rows take one
         with ThreadPoolExecutor(4) as pool:
-            for found in pool.map(lambda _: PENDULUM(*given)[1][0], range(8)):
+            for found in pool.map(lambda _: PENDULUM(*given)[1][0], range(4)):
                 assert same_bits(found, one)
         child = multiprocessing.get_context("fork").Process(target=lambda: PENDULUM(*given, every=900))
         child.start()

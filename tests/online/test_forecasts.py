@@ -67,7 +67,7 @@ def matern(stated: Tensor) -> st.Kernel:
 
 
 @pytest.mark.needs_compiler
-@pytest.mark.parametrize(("kernel", "own"), [(gaussian, True), (anchored, False), (matern, False)])
+@pytest.mark.parametrize(("kernel", "own"), [(gaussian, True), (anchored, False)])
 def test_gradients_of_a_likelihood_are_those_of_differences(
     kernel: Callable[[Tensor], st.Kernel], own: bool
 ) -> None:

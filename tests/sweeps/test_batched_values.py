@@ -76,11 +76,8 @@ def chosen(name: str, cfgs: Sequence[DictConfig], together: Sequence[Any]) -> tu
 
 
 WIDTHS = {
-    "exponential": "seed=3,4",
     "gaussian": "kernel.width=0.7,1.3",
     "matern": "kernel.length_scale=0.7,1.3",
-    "inverse_multiquadric": "kernel.length_scale=0.7,1.3",
-    "rational_quadratic": "kernel.alpha=0.5,2",
     "polynomial": "kernel.bias=0.5,2",
     "anchored": "seed=3,4",
 }
@@ -89,19 +86,13 @@ BATCHES = {
     **{kernel: ([f"kernel={kernel}", "centers.count=6"], [width]) for kernel, width in WIDTHS.items()},
     "shrinking": (["kernel=gaussian", "centers.shrink.offset=0.1"], [WIDTHS["gaussian"]]),
     "fixed step": (["optimizer=fixed_step", "kernel=gaussian"], ["optimizer.step=0.5,1.2"]),
-    "absolute step": (["optimizer=fixed_step", "optimizer.relative=false"], ["optimizer.step=0.01,0.2"]),
     "heavy ball": (["optimizer=heavy_ball"], ["optimizer.step=0.5,0.9", "optimizer.momentum=0.3,0.5"]),
-    "nesterov": (["optimizer=nesterov"], ["optimizer.step=0.5,1.0", "optimizer.momentum=0.3,0.5"]),
-    "normalised lms": (["optimizer=normalised_lms"], ["optimizer.step=0.5,1.0"]),
     "exact": (["optimizer=exact", "kernel=gaussian"], ["seed=3,4"]),
     "secant": (["predictor=secant", "predictor.guarded=true", "certificate=true"], ["seed=3,4"]),
-    "tangent": (["predictor=tangent", "kernel=gaussian"], ["kernel.width=0.7,1.3"]),
-    "chaotic": (["optimizer.inner_steps=1"], ["seed=3,4"]),
     "targets": (["target=cosine"], ["target.phase=0.0,1.0", "target.frequency=1,2"]),
     "steps of time": (["system=linear"], ["dt=0.05,0.049", "settle_time=0.3,0.4,9.0"]),
     "integrated": (["system=van_der_pol"], ["dt=0.05,0.049", "initial_state=[1.0,0.0],[0.5,0.5]"]),
     "plants": (["system=van_der_pol", "kernel=gaussian"], ["system.damping=0.5,1.0"]),
-    "plants that flow": (["system=linear"], ["system.matrix=[[0,1],[-1,0]],[[0,1],[-2,-1]]"]),
     "directions": (["centers=directions"], ["centers.directions=[[1,0],[0,1]],[[0.6,0.8],[-1,0]]"]),
     "single precision": (["dtype=float32", "target=quadratic"], ["target.matrix=1.0,2.0"]),
 }
@@ -194,7 +185,7 @@ def test_a_sweep_of_numbers_and_counts_is_one_call_for_each_count(caplog: pytest
 CLOSED = ("dt=0.005", "duration=0.1", "adp.compile=false", "figures=false")
 SHORT_LOOP = ("adp.optimum.shooting=false", "initial_state=[0.5,0.0]")
 LOOPS = {
-    "information": ([], ["adp.critic=0.4,0.8", "adp.gains.actor=1.2,2.0"]),
+    "information": ([], ["adp.critic=0.4,0.8", "adp.gains.actor=1.2,2.0", "centers.shrink.gain=1,1.5"]),
     "published": (
         ["adp/law=published", "trajectories=2", "adp.gain=250"],
         ["adp.gains.critic_extrapolated=0.25,0.1"],
@@ -203,21 +194,15 @@ LOOPS = {
         ["adp.trust=0.5", "duration=0.5", "dt=0.01"],
         ["adp.actor=[0.2,0.3,0.4],[0.5,0.5,0.5]", "seed=0,1"],
     ),
-    "quadratic": (
-        ["adp/basis=quadratic"],
-        ["adp.gains.normalisation=0.05,0.5", "adp.gains.forgetting=0.003,0.01"],
-    ),
     "lqr": (["adp/policy=lqr"], ["initial_state=[-1.0,1.0],[0.5,0.5]"]),
     "plants": (
         ["adp/policy=lqr", "system=pendulum", *SHORT_LOOP],
         ["system.mass=0.5,2", "adp.cost.control=1,3"],
     ),
-    "bases": ([], ["centers.shrink.gain=1,1.5", "adp.half_width=0.5,0.6"]),
     "behind walls": (
         ["adp/policy=lqr", "system=pendulum", "adp.walls.high=[1.0,null]", "duration=0.015", *SHORT_LOOP],
         ["system.mass=0.5,2"],
     ),
-    "single precision": (["dtype=float32"], ["adp.gains.information=1,2"]),
 }
 
 
@@ -228,7 +213,7 @@ def test_a_closed_loop_in_a_batch_is_the_one_alone(name: str) -> None:
     (group,) = groups(cfgs)
     assert group == list(range(len(cfgs)))
     together = Regulation().solve(cfgs, SHOWN)
-    digits = 1e-9 if name != "single precision" else 1e-3
+    digits = 1e-9
     for each in together:
         if isinstance(each, Exception):
             raise each  # which may say that an extra is absent

@@ -230,16 +230,6 @@ def test_tables_for_pandas_name_the_extra(monkeypatch: pytest.MonkeyPatch) -> No
         runs.to_pandas()
 
 
-def test_own_function_to_figure_in_six_lines_of_a_notebook() -> None:
-    Path("mine.py").write_text("def valley(x):\n    return x[..., 0] ** 2 + x[..., 0] * x[..., 1] ** 3\n")
-    # pip install staf_torch
-    from staf_torch import run
-
-    found = run("target=custom", "target.path=mine.valley", *SHORT)
-    assert found.metrics["ball_error"] < 0.1
-    assert isinstance(found.figures()["gradient_chase"], Figure)
-
-
 def test_memory_is_flat_over_sweeps() -> None:
     counts = []
     for _ in range(3):

@@ -251,10 +251,9 @@ def test_equal_failures_are_told_once_and_end_a_sweep_where_nothing_swept_matter
     assert len(rows(place / "runs" / "alike_here")) == 20  # the other half went well
 
 
-@pytest.mark.parametrize("launcher", ["batched", "basic"])
-def test_a_directory_is_one_jobs(place: Path, launcher: str) -> None:
-    name, chosen = f"places_{launcher}", f"hydra/launcher={launcher}"
-    for text in ("r_${centers.radius}", "${now:%Y}") if launcher == "batched" else ("same",):
+def test_a_directory_is_one_jobs(place: Path) -> None:
+    name, chosen = "places", "hydra/launcher=batched"
+    for text in ("r_${centers.radius}", "${now:%Y}"):
         subdir = f"hydra.sweep.subdir={text}"
         directory, said = sweep(
             place, name, *OWN, chosen, "seed=1,2", "centers.radius=0.1,0.2", subdir, code=1
@@ -262,7 +261,7 @@ def test_a_directory_is_one_jobs(place: Path, launcher: str) -> None:
         assert f"gives two jobs one directory, runs/{name}/" in said
         assert not directory.exists()
     apart = ("r_${centers.radius}_${seed}", "${hydra.job.override_dirname}")
-    for number, text in enumerate(apart if launcher == "batched" else apart[:1]):
+    for number, text in enumerate(apart):
         subdir, coupled = (
             f"hydra.sweep.subdir={text}",
             ["+pair={r:0.1,s:1},{r:0.2,s:2}", "centers.radius=${pair.r}"],

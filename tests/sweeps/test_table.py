@@ -233,12 +233,6 @@ def flip_a_digit(number: int) -> None:
     Path("killed", PARTIAL).write_bytes(b"".join(lines))
 
 
-def lose_a_checksum(number: int) -> None:
-    """The row was on the disk, and its checksum was not yet."""
-    lines = lines_of(SUMS)
-    Path("killed", SUMS).write_bytes(b"".join(lines[: number + 1]) + lines[number + 1][:20])
-
-
 def lose_everything(number: int) -> None:
     Path("killed", PARTIAL).unlink()
 
@@ -246,7 +240,6 @@ def lose_everything(number: int) -> None:
 DAMAGE: dict[str, tuple[Any, int]] = {  # what is done, and the first row that is not whole then
     "a cut row": (cut_in_a_row, 900),
     "another digit": (flip_a_digit, 3),
-    "a cut checksum": (lose_a_checksum, 896),
     "everything": (lose_everything, 0),
 }
 

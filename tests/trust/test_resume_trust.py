@@ -83,7 +83,6 @@ def edit(path: str, before: str, after: str) -> Callable[[Path], None]:
 EDITS: dict[str, tuple[Callable[[Path], None], str]] = {
     "a setting": (edit("conf/experiment/mine.yaml", "0.5", "2.5"), "spread was 0.5 and is now 2.5"),
     "a module": (edit("bowls.py", "SCALE *", "2 * SCALE *"), "the module bowls has changed"),
-    "a module of a made-up name": (edit("bowl_extra.py", "1.0", "3.0"), "the module bowl_extra has changed"),
     "a module of a module": (edit("bowl_helper.py", "1.0", "3.0"), "the module bowl_helper has changed"),
 }
 

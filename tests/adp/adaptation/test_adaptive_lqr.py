@@ -8,7 +8,6 @@ from helpers import tensor, uniform
 from helpers_adaptation import COST, PENDULUM, TRUE
 
 from staf_torch import adp, systems
-from staf_torch.adp.loop.step import ClosedLoop, program
 from staf_torch.numerics.linalg import riccati
 from staf_torch.numerics.riccati import riccati_rows
 
@@ -106,26 +105,6 @@ def test_a_design_that_cannot_be_made_leaves_the_robust_policy_and_not_a_dead_ro
     run = adp.simulate(control, PENDULUM, COST, tensor([[0.1, 0.0]]), dt=0.01, steps=60, compile=False)
     assert not run.diverged.any()
     assert not run["certain"].any()
-
-
-@pytest.mark.needs_compiler
-def test_compiled_steps_are_those_of_the_definition() -> None:
-    more = {
-        "probe": 1.0,
-        "doublings": 4,
-        "filter": adp.ConsiderFilter(PENDULUM, noise=0.01, process=0.01),
-        "rollout": adp.RolloutPolicy.of_lqr(PENDULUM, COST, centers=3, steps=2),
-    }
-    controller = adp.Measured(adaptive(**more), noise=0.01, dim=2)
-    loop = ClosedLoop(controller, CHANGING, CHANGING.cost(COST), dt=0.005)
-    z0 = CHANGING.start(uniform(9, 2, seed=1), (1.5 + uniform(9, 2, seed=2)) * TRUE)
-    steps, draws = program(loop, True), uniform(9, 25, controller.draws, CHANGING.dim, seed=3)
-    state = loop.init(z0)
-    assert steps.compiles(state, draws)
-    got, want = steps(state, draws)[0], steps.definition(state, draws)[0]
-    torch.testing.assert_close(got, want, rtol=1e-9, atol=1e-9)
-    part = steps(loop.init(z0[:3]), draws[:3])[0]  # rows do not know of each other
-    assert torch.equal(part.carried.estimate.theta, got.carried.estimate.theta[:3])
 
 
 def test_behind_walls_parameters_are_learned_from_the_plant_and_the_design_is_of_the_barrier() -> None:

@@ -152,26 +152,3 @@ def test_the_less_is_known_of_theta_the_more_a_measurement_counts() -> None:
     assert shares == sorted(shares)
     assert shares[0] < 0.7
     assert shares[-1] > 0.999
-
-
-DRAGGED = [[-1.0, -4.0], [1.0, 4.0]]  # the box of a pendulum whose mass is not known
-
-
-@pytest.mark.parametrize("factor", [0.5])
-def test_behind_a_barrier_the_mean_of_the_filter_costs_less_than_what_is_measured(factor: float) -> None:
-    plant = adp.ParametricPlant.of_effectiveness(systems.Pendulum())
-    box, truth = (systems.Barrier(each, *DRAGGED) for each in (plant, plant.believing(tensor([1 / factor]))))
-    model, cost = adp.ParametricPlant.of_barrier(box), adp.QuadraticCost(1.0, 1.0, 2, 1)
-    s0 = box.transform(torch.stack((uniform(20, seed=4) * 0.4, uniform(20, seed=5) * 0.5), dim=-1))
-    paid = {}
-    for filtered in (False, True):
-        windows = adp.IntegralWindows(plant, 0.05, states=box.inverse)
-        law = adp.LeastSquares([1.0], deviation=0.5, floor=1e-6)
-        filter = adp.ConsiderFilter(model, noise=0.01) if filtered else None
-        adaptive = adp.AdaptiveLQR(model, cost, windows, law, filter=filter, doublings=7)  # a short program
-        own = adp.Measured(adaptive, noise=0.01, dim=2)
-        run = adp.simulate(own, truth, cost, s0, dt=0.005, steps=600, every=20, compile=True)
-        assert not bool(run.diverged.any())
-        assert float(box.margin(run.state).min()) > 0.2
-        paid[filtered] = run.cost
-    assert float(paid[True].mean()) < float(paid[False].mean())

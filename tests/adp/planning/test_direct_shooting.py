@@ -56,9 +56,8 @@ def test_three_state_optimum() -> None:
     [
         (systems.Pendulum(), COST, 40),
         (systems.Pendulum(), adp.BoundedInputCost(1.0, 0.1, 2, 1, bound=8.0), 48),
-        (systems.PlanarQuadrotor(), adp.QuadraticCost(1.0, 1.0, 6, 2), None),
     ],
-    ids=["pendulum", "bounded pendulum", "quadrotor"],
+    ids=["pendulum", "bounded pendulum"],
 )
 def test_gradient_and_control_solve_the_hjb_equation(
     plant: systems.ControlAffineSystem, cost: adp.Cost, intervals: int | None
@@ -76,44 +75,12 @@ def test_gradient_and_control_solve_the_hjb_equation(
     assert (best.value < run.cost * (1 + 1e-4)).all()
 
 
-def test_tracking_has_an_optimum_with_a_base_and_a_terminal_value_of_its_own() -> None:
-    lqr = adp.LQR(PLANT, adp.QuadraticCost(10.0, 1.0, 2, 1))
-    shooting = adp.DirectShooting(
-        systems.TwoStateTracking(),
-        adp.tracking_cost(10.0, 1.0),
-        base=lambda x: lqr(x[..., :2]),
-        terminal=lambda x: lqr.value(x[..., :2]),
-        horizon=4.0,
-        intervals=60,
-    )
-    best = shooting.solve(torch.tensor([[-0.5, 0.5, 0.0, 1.0]], dtype=torch.float64))
-    assert float(best.value) == pytest.approx(1.4223, abs=1e-4)
-
-
-class HalfBroken(systems.TwoState):
-    def drift(self, x: Tensor) -> Tensor:
-        return torch.where(x[..., :1] > 1.0, torch.nan, super().drift(x))
-
-
 def test_row_that_fails_on_the_coarse_mesh_starts_again_on_the_fine_one() -> None:
     x = uniform(6, 2.0)[:1]
     best = adp.DirectShooting(PLANT, COST, intervals=32, iterations=10, starts=1).solve(x)
     assert torch.isinf(best.mesh_error).all()  # nothing to compare with
     assert best.converged.all()
     assert (best.value / PLANT.optimal_value(x, COST.q, COST.r) - 1).abs().max() < 1e-4
-
-
-def test_rows_are_alone_and_a_row_without_optimum_is_reported() -> None:
-    x = torch.tensor([[-1.0, 1.0], [1.2, 0.3], [0.0, 0.0], [0.4, -0.7]], dtype=torch.float64)
-    best = adp.DirectShooting(HalfBroken(), COST, horizon=2.0, intervals=12, starts=2).solve(x)
-    assert best.converged.tolist() == [True, False, True, True]
-    assert torch.isnan(best.value[1])
-    assert torch.isnan(best.control[1]).all()
-    assert float(best.value[2]) == 0.0
-    assert torch.equal(best.gradient[2], torch.zeros(2, dtype=torch.float64))
-    alone = adp.DirectShooting(PLANT, COST, horizon=2.0, intervals=12).solve(x[3:])
-    torch.testing.assert_close(best.value[3], alone.value[0], rtol=1e-11, atol=0)
-    torch.testing.assert_close(best.gradient[3], alone.gradient[0], rtol=1e-7, atol=1e-9)
 
 
 def test_too_few_iterations_are_reported_and_not_passed_off_as_an_optimum() -> None:
@@ -205,10 +172,10 @@ class Swing(systems.ControlAffineSystem):
 
 def test_swing_up_that_ipopt_finds_from_one_of_six_starts_is_found() -> None:
     """casadi 3.7, IPOPT on 80 intervals, its best of six and of twelve starts: others end at 30 to 36."""
-    x0 = torch.tensor([[1.0, 0.0], [-1.8198211599005722, 0.7069564836707163]], dtype=torch.float64)
+    x0 = torch.tensor([[-1.8198211599005722, 0.7069564836707163]], dtype=torch.float64)
     cost = adp.QuadraticCost([[1.0, 0.0], [0.0, 0.1]], 0.01, dim=2, inputs=1, low=-2.0, high=2.0)
-    found = adp.DirectShooting(Swing(), cost, horizon=4.0).solve(x0)
-    assert found.value.tolist() == pytest.approx([17.2734, 16.9234], rel=2e-3)
+    found = adp.DirectShooting(Swing(), cost, horizon=4.0, intervals=48).solve(x0)
+    assert found.value.tolist() == pytest.approx([16.9234], rel=2e-3)
     assert found.converged.all()
     assert float(found.plan.abs().max()) <= 2
 
@@ -220,7 +187,7 @@ def test_a_linear_plant_whose_cost_has_two_valleys_is_not_believed_at_once() -> 
         1.0, 0.1, dim=1, inputs=1, low=-3.0, high=3.0, output=lambda x: x * (1 - x / 3) * (1 + x / 30)
     )
     search = adp.DirectShooting(
-        plant, cost, horizon=4.0, intervals=24, terminal=lambda x: 0 * x.square().sum(-1)
+        plant, cost, horizon=4.0, intervals=16, terminal=lambda x: 0 * x.square().sum(-1)
     )
     found = search.solve(torch.tensor([[2.4]], dtype=torch.float64))
     assert found.reason[0].startswith("local: one start alone found it")
@@ -285,8 +252,8 @@ def test_of_two_valleys_the_lower_one_is_found_from_several_starts() -> None:
     left, whole = (11 * a - a**2 / 2 - 11 * math.log(1 + a) for a in (3.2, 10.0))
     given: dict[str, Any] = {"base": lambda x: torch.where(x < ridge, -y(x), y(x)), "horizon": 4.0}
     given["terminal"] = lambda x: y(x)[..., 0].square()
-    alone = adp.DirectShooting(plant, cost, **given, intervals=40).solve(x)  # no LQR to doubt it by
-    search = adp.DirectShooting(plant, cost, **given, intervals=40, starts=3)
+    alone = adp.DirectShooting(plant, cost, **given, intervals=24).solve(x)  # no LQR to doubt it by
+    search = adp.DirectShooting(plant, cost, **given, intervals=24, starts=3)
     found = search.solve(torch.cat((x, 0.1 * x)))
     assert whole > 2 * left  # the base goes downhill, to 10
     assert float(alone.value) == pytest.approx(2 * left, rel=1e-2)
@@ -339,25 +306,3 @@ def test_the_gap_of_a_control_is_what_its_hamiltonian_exceeds_the_least_by(affin
         [hamiltonian(torch.full((50, 1), u).double()) for u in torch.linspace(-0.8, 0.8, 2001)]
     )
     torch.testing.assert_close(gap, hamiltonian(v) - tried.amin(0), rtol=1e-4, atol=1e-5)
-
-
-def test_what_costs_more_than_the_base_is_nan_with_that_reason() -> None:
-    class Wheel(systems.ControlAffineSystem):
-        dim, inputs = 3, 1
-
-        def drift(self, x: Tensor) -> Tensor:
-            return torch.stack((x[..., 1], 40 * x[..., 0].sin(), -0.5 * x[..., 2]), dim=-1)
-
-        def effectiveness(self, x: Tensor) -> Tensor:
-            return torch.tensor([[0.0], [-30.0], [600.0]]).to(x).expand(*x.shape, 1)
-
-    plant, x0 = Wheel(), torch.tensor([[-0.1928, -0.2978, 16.2682]], dtype=torch.float64)
-    cost = adp.QuadraticCost([10.0, 1.0, 1e-4], 1.0, dim=3, inputs=1, low=-1.0, high=1.0)
-    with lanes.compiling("never"):  # searched for once: a compiler takes longer
-        found = adp.DirectShooting(plant, cost, starts=1, horizon=1.0, intervals=20).solve(x0)
-    lqr = adp.LQR(plant, cost, period=0.01)
-    base = adp.simulate(lqr, plant, cost, x0, dt=0.01, steps=100, compile=False).cost
-    if bool(found.value.isnan()):
-        assert found.reason[0]
-    else:
-        assert found.value <= base * 1.02

@@ -79,22 +79,15 @@ def test_a_rate_with_a_kink_at_rest_is_planned_as_its_smooth_half(caplog: pytest
     torch.testing.assert_close(costs[0], best.cost, rtol=1e-3, atol=0.0)
     assert (costs[1] <= 1.001 * best.cost).all()
     assert (costs[2] <= 1.5 * best.cost).all()
-    shot = adp.DirectShooting(
-        KINK, ONE, horizon=1.4, terminal=0.0, intervals=14, iterations=12, starts=2
-    ).solve(x0)
-    assert (shot.value <= 1.01 * best.cost).all()
-    assert all(reason.startswith("local") for reason in shot.reason)
 
 
 def test_a_unicycle_parks_sideways() -> None:
     cost = adp.QuadraticCost([1.0, 1.0, 0.1], 0.1, dim=3, inputs=2, low=-1.0, high=1.0, terminal=5.0)
     x0 = tensor([[0.0, 0.4, 0.0]])
-    shot = adp.DirectShooting(Unicycle(), cost, horizon=1.4, intervals=8, iterations=12, starts=1).solve(x0)
     still = 1.4 * 0.4**2 + 5 * 0.4**2  # what standing where it is costs
     problem = adp.SampledProblem.of(Unicycle(), cost, dt=0.1)
     plan = adp.BoxDDP(problem, steps=14, iterations=12, compile=False).solve(x0)
-    assert float(shot.value) < 0.6 * still
-    torch.testing.assert_close(plan.cost, shot.value, rtol=0.02, atol=0.0)
+    assert float(plan.cost) < 0.6 * still
 
 
 def test_a_block_that_sticks_is_moved() -> None:

@@ -137,21 +137,3 @@ def test_a_plan_that_is_followed_is_its_feedback_and_then_that_of_the_goal_also_
         torch.testing.assert_close(u, answered)
         torch.testing.assert_close(compiled[:, k], u, rtol=0, atol=1e-12)
         x, _ = pushed(x, u)
-
-
-def test_a_loop_carries_on_the_plans_of_the_rows_that_need_one() -> None:
-    """Near a bound a plan is carried; else the policy has the control, bit for bit. Rows are alone."""
-    plant = systems.Linear([[0.0, 1.0], [1.0, 0.0]], [[0.0], [1.0]])
-    cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, low=-1.0, high=1.0)
-    policy = adp.near_optimal(plant, cost, dt=0.1, reach="local")
-    loop, x = policy.controller(), tensor([[0.6, 0.1], [0.05, 0.0], [math.nan, 0.0]])
-    assert loop.label == adp.Feedback(policy).label
-    carried = loop.init(x)
-    for _ in range(2):
-        u, after = loop.step(x, carried, x, 0.1)
-        assert torch.equal(u[1:2], policy(x[1:2]))
-        one, its = loop.step(x[:1], rows_of(carried, slice(1)), x[:1], 0.1)
-        torch.testing.assert_close(one, u[:1], rtol=1e-9, atol=1e-9)
-        torch.testing.assert_close(its.plan, after.plan[:1], rtol=1e-9, atol=1e-9)
-        assert float(u[0].abs()) <= 1
-        carried, x = after, x + 0.1 * plant.motion(x, u)

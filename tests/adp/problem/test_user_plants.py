@@ -31,13 +31,6 @@ def turn_torch(x: Tensor, u: Tensor) -> Tensor:
     return torch.stack((angle + rate * PERIOD, rate), dim=1)
 
 
-def fly(x: Tensor, u: Tensor) -> Tensor:
-    """A planar quadrotor by the thrusts of its two rotors."""
-    lift, lean = (u[:, 0] + u[:, 1]) / 0.027, 0.0397 * (u[:, 1] - u[:, 0]) / (1.4e-5 * math.sqrt(2))
-    speeds = (x[:, 2].sin() * lift, x[:, 2].cos() * lift - 9.81, lean)
-    return torch.cat((x[:, 3:], torch.stack(speeds, dim=1)), dim=1)
-
-
 def pendulum(function: object = turn, **more: object) -> systems.StepPlant:
     given = {"dim": 2, "inputs": 1, "dt": PERIOD, "periodic": [0], "low": -2.0, "high": 2.0} | more
     return systems.StepPlant(function, **given)
@@ -81,22 +74,6 @@ def test_lqr_of_a_step_plant_is_that_of_the_held_plant_in_continuous_time() -> N
     assert adp.held_stability(slow, plant, 0.3).spectral_radius < 1
     with pytest.raises(ValueError, match=r"must be a multiple of the plant's period of 0.1 s; got 0.25"):
         adp.LQR(plant, COST, period=0.25)
-
-
-@torch.no_grad()
-def test_quadrotor_by_its_rotors_hovers_and_flies_to_a_set_point_within_its_bounds() -> None:
-    plant = systems.RatePlant(fly, dim=6, inputs=2, periodic=[2], low=0.0, high=0.3)
-    hover = torch.full((2,), 0.027 * 9.81 / 2, dtype=torch.float64)
-    torch.testing.assert_close(plant.resting_input(), hover, rtol=1e-9, atol=0)
-    cost = adp.QuadraticCost(1.0, 0.1, dim=6, inputs=2, target=[0.3, 0.2, 0.0, 0.0, 0.0, 0.0])
-    lqr = adp.LQR(plant, cost, period=0.02)
-    start = torch.zeros(1, 6, dtype=torch.float64)
-    run = adp.simulate(adp.Feedback(lqr), plant, cost, start, steps=500)
-    assert isinstance(plant.bounds, systems.Bounds)
-    assert lqr.cost.bounds is plant.bounds
-    assert plant.bounds.contain(run.control[:, :-1]).all()
-    torch.testing.assert_close(run.state[0, -1], lqr.cost.target, rtol=0, atol=1e-3)
-    assert float(run.cost) >= float(lqr.value(start)) * 0.99
 
 
 def test_rest_is_searched_from_the_guess() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import math
 import pickle
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,9 +13,8 @@ import torch
 from helpers import tensor, uniform
 from torch import Tensor
 
-from staf_torch import adp, deploy, systems
+from staf_torch import adp, systems
 from staf_torch.adp.safety.box_filter import walls
-from staf_torch.deploy.c_header import runner_c
 
 LINE = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
 PLANE = systems.Linear(
@@ -140,18 +138,6 @@ def test_weights_say_which_input_shall_move() -> None:
     dear = adp.SafetyFilter(lambda x: x, PLANE, both, dt=0.01, weight=[1e6, 1.0]).restrain(x, want).control
     torch.testing.assert_close(even, tensor([0.0, 0.0]), rtol=0, atol=1e-9)
     torch.testing.assert_close(dear, tensor([1.0, -1.0]), rtol=0, atol=1e-5)
-
-
-@pytest.mark.needs_compiler
-def test_in_c_it_is_the_same(tmp_path: Path) -> None:
-    guard = adp.SafetyFilter(adp.LQR(PLANE, COST4), PLANE, [passing], dt=0.05, low=-1.0, high=1.0)
-    policy = deploy.policy_of(guard)
-    z = torch.cat((uniform(30, 4, seed=8), uniform(30, 1, low=0.0, high=1.0, seed=9)), dim=-1)
-    deploy.export_c(policy, z[:1], tmp_path / "guard.h", ["control"])
-    (control,) = runner_c(tmp_path / "guard.h", [2], torch.float64)(z)
-    torch.testing.assert_close(control, policy(z), rtol=0, atol=1e-9)
-    torch.testing.assert_close(policy(z), guard(z[:, :4], z[:, 4]))
-    assert bool((control != guard.bounds.clip(adp.LQR(PLANE, COST4)(z[:, :4]))).any())
 
 
 def test_a_copy_a_pickle_and_single_precision_are_the_same_filter() -> None:
