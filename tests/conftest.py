@@ -1,4 +1,4 @@
-"""What every test starts from."""
+"""What every test starts from. torch is imported where tests run, and not by a process that starts others."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ import shutil
 import sys
 from collections.abc import Generator, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-import hypothesis
 import pytest
-import torch
-import yaml
 from absent_extras import pytest_make_collect_report, pytest_runtest_makereport
-from recorded import Record
+
+if TYPE_CHECKING:
+    from recorded import Record
 
 __all__ = ["pytest_make_collect_report", "pytest_runtest_makereport"]
 
@@ -44,13 +44,6 @@ AS_FOR_USERS = (
 beside others or rounding are the matter. A filter of streams then takes 8 s to build, and 1 s otherwise."""
 
 logging.getLogger("staf_torch.lanes.calls.choice").setLevel("ERROR")  # the suite is many short calls
-for logger in logging.root.manager.loggerDict.values():
-    if isinstance(logger, logging.Logger) and logger.name.startswith("torch"):
-        # Else pytest adds its handlers to each of fifty loggers and takes them off again, six times a test.
-        logger.propagate = True
-
-hypothesis.settings.register_profile("suite", max_examples=25, deadline=None, derandomize=True)
-hypothesis.settings.load_profile("suite")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -93,6 +86,16 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
             pytest.skip("needs a C++ compiler")
 
 
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Say how examples of `hypothesis` are drawn, before any are collected."""
+    if getattr(session.config.option, "numprocesses", None) and "PYTEST_XDIST_WORKER" not in os.environ:
+        return  # others run the tests
+    import hypothesis
+
+    hypothesis.settings.register_profile("suite", max_examples=25, deadline=None, derandomize=True)
+    hypothesis.settings.load_profile("suite")
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
     """Collect tests without looking for garbage, a quarter of that time: all of them stay."""
@@ -111,10 +114,42 @@ def _settings_are_trusted_as_by_the_command() -> Iterator[None]:
 
     It also reads `conf/` anew for each of some hundred commands, faster by the parser in C.
     """
+    import yaml
+
     from staf_torch.sweeps.hydra_compat import trusted
 
+    for logger in logging.root.manager.loggerDict.values():
+        if isinstance(logger, logging.Logger) and logger.name.startswith("torch"):
+            # Else pytest adds its handlers to each of fifty and takes them off again, six times a test.
+            logger.propagate = True
     yaml.SafeLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     with trusted(path.stem for path in Path(__file__).parent.rglob("*.py")):
+        yield
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _figures_are_finished_in_their_own_room() -> Iterator[None]:
+    """Where panels lie, and what a PDF holds, take three quarters of a figure's time; forks inherit this."""
+    figures, layouts = (sys.modules.get(f"matplotlib.{name}") for name in ("figure", "layout_engine"))
+    with pytest.MonkeyPatch.context() as patch:
+        if figures is not None and layouts is not None:
+            laid_out, saved = layouts.ConstrainedLayoutEngine.execute, figures.Figure.savefig
+
+            def at_home() -> bool:
+                return os.environ.get("PYTEST_CURRENT_TEST", "").startswith("tests/figures")
+
+            def execute(engine: object, figure: object) -> None:
+                if at_home():
+                    laid_out(engine, figure)
+
+            def savefig(figure: object, file: Any, **given: Any) -> None:
+                if given.get("format") == "pdf" and not at_home():
+                    file.write(b"%PDF-1.4 not rendered")
+                else:
+                    saved(figure, file, **given)
+
+            patch.setattr(layouts.ConstrainedLayoutEngine, "execute", execute)
+            patch.setattr(figures.Figure, "savefig", savefig)
         yield
 
 
@@ -127,6 +162,8 @@ def _alike_in_every_order(
     Nothing compiles by itself but in the rooms of `COMPILED` and where a test is marked `compiled`: a build
     is a second a program.
     """
+    import torch
+
     from staf_torch import lanes
 
     # `torch.manual_seed` also writes down, for every kind of device and with the stack, what is to be done
@@ -141,9 +178,6 @@ def _alike_in_every_order(
     if room in ("adp", "deploy") and quick_cc is not None:
         monkeypatch.setenv("CC", str(quick_cc))
     compiled = room in COMPILED or request.node.get_closest_marker("compiled") is not None
-    if room != "figures" and "matplotlib.layout_engine" in sys.modules:
-        # Where panels lie takes nine tenths of a figure's time, and is the matter of that room alone.
-        monkeypatch.setattr("matplotlib.layout_engine.ConstrainedLayoutEngine.execute", lambda *_: None)
     with lanes.compiling("auto" if compiled else "never"):
         yield
 
@@ -163,4 +197,6 @@ def quick_cc(tmp_path_factory: pytest.TempPathFactory) -> Path | None:
 @pytest.fixture
 def record(request: pytest.FixtureRequest) -> Record:
     """Compares with what is recorded."""
+    from recorded import Record
+
     return Record(request)

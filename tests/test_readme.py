@@ -212,24 +212,20 @@ def overrides(command: str) -> list[str]:
     return words
 
 
-def jobs(words: list[str]) -> list[list[str]]:
-    """Plain overrides: each choice of a swept group once, and of every other sweep the first value."""
-    parsed = OverridesParser.create().parse_overrides(words)
-    values: list[list[str]] = []
-    for word, override in zip(words, parsed, strict=True):
+def job(words: list[str]) -> list[str]:
+    """Plain overrides: of every sweep the first value. Each choice of a group that is swept is a file."""
+    plain = []
+    for word, override in zip(words, OverridesParser.create().parse_overrides(words), strict=True):
+        key, folder = override.get_key_element(), ROOT / "conf" / override.key_or_group
         if not override.is_sweep_override():
-            values.append([word])
+            plain.append(word)
         elif override.is_discrete_sweep():
-            count = None if (ROOT / "conf" / override.key_or_group).is_dir() else 1
-            swept = itertools.islice(override.sweep_string_iterator(), count)  # not a million seeds
-            values.append([f"{override.get_key_element()}={value}" for value in swept])
+            first, *others = itertools.islice(override.sweep_string_iterator(), 100)
+            plain.append(f"{key}={first}")
+            assert not folder.is_dir() or all((folder / f"{each}.yaml").is_file() for each in others), word
         else:
-            values.append([f"{override.get_key_element()}={override.value().start}"])
-    first = [choices[0] for choices in values]
-    others = [
-        [*first[:i], choice, *first[i + 1 :]] for i, choices in enumerate(values) for choice in choices[1:]
-    ]
-    return [first, *others]
+            plain.append(f"{key}={override.value().start}")
+    return plain
 
 
 STAF = {command: name(path) for path in [README, *MANUALS] for command in commands(read(path), "staf")}
@@ -247,8 +243,7 @@ def test_the_front_page_names_commands() -> None:
     ids=lambda command: command.replace("::", ":"),
 )
 def test_settings_of_a_command_compose(command: str) -> None:
-    for job in jobs(overrides(command)):
-        assert OmegaConf.select(settings(*job), "task"), STAF[command]
+    assert OmegaConf.select(settings(*job(overrides(command))), "task"), STAF[command]
 
 
 @pytest.mark.parametrize(("program", "main"), [("staf-table", table.main), ("staf-export", export.main)])

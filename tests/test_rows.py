@@ -115,9 +115,8 @@ def test_scenes_with_discs_of_their_own_stand_behind_one_filter() -> None:
 
     with lanes.compiling("always"):
         run = adp.simulate(safe(st.rows(walls)), plant, cost, x0, steps=30)
-        alone = adp.simulate(safe(walls[1]), plant, cost, x0[:1], steps=30)
-    assert torch.equal(run.state[1], alone.state[0])
-    assert not torch.equal(run.state[0], alone.state[0])
+        alone = adp.simulate(safe(walls[2]), plant, cost, x0[:1], steps=30)
+    assert torch.equal(run.state[2], alone.state[0])
 
 
 def test_a_program_of_a_users_own_takes_columns_and_other_numbers_need_no_compiler() -> None:

@@ -55,7 +55,7 @@ class StaFRegressor(StreamEstimator):
         >>> model.predict(x).shape
         torch.Size([])
 
-        Shown by `tests/examples/notebooks/stream.py`.
+        Shown by `staf_torch/guides/stream_with_bands.md`.
 
     Args:
         kernel: a `Kernel`, or the name of one in `kernels.NAMED`.

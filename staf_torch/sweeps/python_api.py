@@ -55,7 +55,7 @@ def run(*overrides: str, directory: str | Path | None = None) -> Run:
         >>> run("kernel=gaussian", "duration=6.0", "figures=false", directory="runs/gaussian")
         <Run completed: kernel=gaussian duration=6.0 figures=false, ball_error=...>
 
-        Shown by `tests/examples/notebooks/chasing.py`.
+        Shown by `staf_torch/sweeps/README.md`.
 
     Args:
         overrides: as on the command line, without the shell's quotes: `"initial_state=[1.0,0.0]"`.
@@ -99,7 +99,7 @@ def sweep(*overrides: str, directory: str | Path | None = None) -> Runs:
         >>> runs.best("ball_error").setting("centers.radius")
         0.1
 
-        Shown by `tests/examples/notebooks/sweep_and_table.py`.
+        Shown by `staf_torch/sweeps/README.md`.
 
     Args:
         overrides: as on the command line, without the shell's quotes.
@@ -131,7 +131,7 @@ def read_runs(path: str | Path | Sequence[str | Path]) -> Runs:
         >>> read_runs("runs/radii")
         <Runs 2 completed, over centers.radius>
 
-        Shown by `tests/examples/notebooks/sweep_and_table.py`.
+        Shown by `staf_torch/sweeps/README.md`.
 
     Raises:
         ValueError: if a path does not exist or no run is found.

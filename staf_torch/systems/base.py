@@ -285,7 +285,7 @@ class ControlAffineSystem(Plant):
         >>> Trolley().rate(torch.tensor([0.0, 1.0]), torch.tensor([0.5]))
         tensor([1.0000, 0.3000])
 
-        Shown by `tests/examples/notebooks/own_plant.py`.
+        Shown by `tests/examples/own/trolley.py`.
     """
 
     @abc.abstractmethod

@@ -16,7 +16,6 @@ from staf_torch import adp, systems
 from staf_torch.experiments import adp_comparison
 from staf_torch.experiments.adp import Regulation, count_the_restless, held_radius
 from staf_torch.settings.adp import adp_problem
-from staf_torch.signs import Progress
 
 SHORT = ("experiment=adp", "duration=0.1", "dt=0.005", "figures=false")
 
