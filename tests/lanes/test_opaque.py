@@ -1,4 +1,4 @@
-"""What compiles itself under `torch.compile` and `torch.export`."""
+"""What compiles itself under `torch.compile`, `torch.export` and `torch.jit.trace`."""
 
 from __future__ import annotations
 
@@ -77,3 +77,23 @@ def test_torch_export_takes_a_compiled_method_or_says_what_does() -> None:
         ValueError, match=r"`torch.export` does not take a safety filter.*deploy.trace\(policy, x\)"
     ):
         torch.export.export(filtered, (X0,))
+
+
+class Traced(nn.Module):
+    """A program, a chase and a trajectory of the states."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.program = lanes.Program(lambda x, now, row: (x.sin(), x))
+
+    def forward(self, x: Tensor) -> tuple[Tensor, ...]:
+        chased = st.chase(STATES + x[:, None], BASIS, st.targets.Paper(), st.optim.Exact())
+        moved = systems.simulate(PLANT, x, dt=0.02, steps=12)
+        return self.program(x, steps=3)[0], chased.value, moved, POLICY(x)
+
+
+@pytest.mark.filterwarnings("ignore")  # torch.jit is deprecated, and a trace tells of every branch
+def test_a_trace_of_torch_jit_computes_with_its_own_inputs() -> None:
+    """Machine code is unseen by it: its results would be constants of the trace, or the process would end."""
+    traced = torch.jit.trace(model := Traced(), (X0,), check_trace=False)
+    torch.testing.assert_close(traced(X0 + 0.1), model(X0 + 0.1))

@@ -90,7 +90,8 @@ def _one_device(leaves: Sequence[Any], recorded: bool) -> Where:
 
 def seen_by_others() -> bool:
     """Return whether a tracer, a transform of torch.func or forward mode looks at the operations."""
-    return _transforms() is not None or forward_ad._current_level >= 0 or _modes() > 0
+    looks = _transforms() is not None or forward_ad._current_level >= 0 or _modes() > 0
+    return looks or _tracing() is not None
 
 
 def transformed() -> bool:
@@ -105,6 +106,7 @@ def traced() -> bool:
 
 _TENSORS = (Tensor, torch.nn.Parameter)
 _transforms, _modes = torch._C._functorch.peek_interpreter_stack, torch._C._len_torch_dispatch_stack
+_tracing = torch._C._get_tracing_state  # of `torch.jit.trace`
 
 
 def at_once(x: Tensor) -> bool:
