@@ -68,30 +68,22 @@ def near_optimal(
     **Reach.** The box is the plant's ``spread`` around the set-point, and of periodic coordinates the whole
     turn. The LQR is followed within its bounds from 24 states of it and the ends of its axes, in less than
     half a second. Where it regulates them all (to 1 % of where they began; within bounds for at most four
-    times its value) the policy is the local one below. Else a global value of the box is learnt, as
-    `learn_global_value` does it: of two states in seconds, of four in up to some minutes, of at most six, for
-    a plant in torch with at most two inputs. The policy then follows the cheapest of the optimal trajectories
-    that this memory finds near x. Outside of the box it does the same from the nearest ones, and where none
-    of them is near enough to be followed it is the LQR within its bounds, if that promises less. Where states
-    are left that are not regulated, or cost more than 1.02 of the best trajectories known, or where nobody
-    could look, the log has one warning with the numbers; ``policy.reach`` and ``report()`` keep them.
+    times its value) the policy is the local one below. Else a global value of the box is learnt
+    (`learn_global_value`), for a plant in torch of at most six states and two inputs, and the policy follows
+    the cheapest of the optimal trajectories near x; where none is near enough it is the LQR within its
+    bounds. States that are not regulated, cost more than 1.02 of the best trajectories known, or at which
+    nobody could look, are one warning with the numbers; ``policy.reach`` and ``report()`` keep them.
 
-    **Local.** The rules: the base is the LQR made for dt; the horizon is two time constants of its slowest
-    mode (three with plans), 12 to 60 periods, four quarters; 2 m + 1 centers lie along the m inputs, at
-    ``radius`` from the state and on it, as `SampledRollout` says (with more inputs than states, around the
-    state as many as quadratics need); a plant in continuous time is integrated to 1e-6 of its state, in
-    as many steps as that takes.
+    **Local.** The base is the LQR made for dt; the horizon is two time constants of its slowest mode (three
+    with plans), 12 to 60 periods, four quarters; 2 m + 1 centers lie along the m inputs, at ``radius`` from
+    the state and on it (with more inputs than states, around the state as many as quadratics need).
 
-    Rollouts of an LQR do not know what to do before a bound of the inputs. Where the LQR, followed from x
-    over the horizon, meets one (``report()`` says how often, ``strained``), the policy's ``controller()``,
-    for loops, carries a plan by `BoxDDP` over three time constants and improves it from control to control,
-    in some milliseconds, until no bound is met any more. A first state of this kind gets the best plan of
-    those begun from the LQR and from holding a bound for a while: it is made before the loop, by ``init``;
-    a row that comes to a bound later begins from the LQR. After `lanes.ready` of the policy ``init``
-    compiles what plans need. It takes a plant in torch, held for one period of its own, without a discount;
-    else, and without bounds, ``controller()`` is the policy alone. With ``plan`` it is a `RecedingHorizon`,
-    which plans all the time, and the policy as a function of x makes a plan anew, in tens of milliseconds,
-    where a bound is met; in a loop two ways around that cost nearly the same would take turns.
+    **Bounds.** Where the LQR, followed from x over the horizon, meets a bound (``report()["strained"]``), the
+    policy's ``controller()``, for loops, carries a plan by `BoxDDP` and improves it from control to control,
+    in some milliseconds, until no bound is met any more. Rows that begin so get the best of several plans,
+    made by ``init`` and, after `lanes.ready` of the policy, compiled there. That takes a plant in torch, held
+    for one period of its own, without a discount; else ``controller()`` is the policy alone.
+
     **Rows.** With numbers of rows (`staf_torch.rows`) every row has its own policy, horizon and steps of
     integration. All are made at once, but for rows that need a global value: each is learnt by itself.
 
@@ -116,8 +108,10 @@ def near_optimal(
         high: likewise.
         radius: of the ball of centers, in units of the state: measure states so that 1 is a large one.
         horizon: s; None for the rule above.
-        plan: whether to plan where the LQR would meet a bound. Such a policy is exported to C as its
-            ``controller()``, and loops with it are compiled where that is asked for. Not with a global value.
+        plan: whether to plan all the time: ``controller()`` is a `RecedingHorizon`, and the policy as a
+            function of x plans anew, in tens of milliseconds, where the LQR would meet a bound (in a loop two
+            ways around that cost nearly the same would take turns). Exported to C as its ``controller()``;
+            loops are compiled where that is asked for. Not with a global value.
         reach: ``auto`` for the rule above; ``local``: nobody looks how far the LQR leads; ``global``: the
             global value, also where the LQR would do.
         substeps: integration steps a period of a plant in continuous time; None for as many as are accurate.

@@ -33,9 +33,7 @@ from .planning.receding_horizon import BoundedPlans, StrainedPlans
 from .planning.shooting import DirectShooting
 from .policies.sampled_rollout import SampledRollout
 from .problem.held_linear import held_stability
-from .problem.rules import (
-    slowest,
-)
+from .problem.rules import slowest
 from .problem.sampled import SampledProblem
 from .reach import Reach, arrived, drawn
 

@@ -75,18 +75,13 @@ def box_minimum(
 def minimum_and_slopes(
     curvature: Tensor, slope: Tensor, cross: Tensor, low: Tensor, high: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return `box_minimum` of u'Hu / 2 + (c + C x)'u at x = 0, and du/dx there: (B, m), (B, m, n)."""
+    """Return `box_minimum` of u'Hu / 2 + (c + C x)'u at x = 0, C (B, m, n), and du/dx there, 0 for inputs at
+    a bound: (B, m), (B, m, n)."""
     u = box_minimum(curvature, slope, low, high)
-    return u, slopes_of_minimum(curvature, cross, (u > low) & (u < high))
-
-
-def slopes_of_minimum(hessian: Tensor, cross: Tensor, free: Tensor) -> Tensor:
-    """du/dx of the minimum of u'Hu/2 + (s + C x)'u over a box, 0 for inputs at a bound: H (B, m, m), C
-    (B, m, n), ``free`` (B, m) bool -> (B, m, n)."""
-    share = free.to(hessian)
-    masked = hessian * share.unsqueeze(-1) * share.unsqueeze(-2) + torch.diag_embed(1 - share)
+    free = ((u > low) & (u < high)).to(curvature)
+    masked = curvature * free.unsqueeze(-1) * free.unsqueeze(-2) + torch.diag_embed(1 - free)
     inverse = 1 / masked if masked.shape[-1] == 1 else torch.linalg.inv(masked)
-    return -(inverse.unsqueeze(-1) * (share.unsqueeze(-1) * cross).unsqueeze(-3)).sum(-2)
+    return u, -(inverse.unsqueeze(-1) * (free.unsqueeze(-1) * cross).unsqueeze(-3)).sum(-2)
 
 
 def _clip(u: Tensor, low: Tensor, high: Tensor) -> Tensor:

@@ -133,12 +133,9 @@ def _tensors(given: tuple[object, ...]) -> Iterator[Tensor]:
         if isinstance(each, Tensor):
             yield each
         elif isinstance(each, nn.Module):  # names, as `parameters()` finds them, take ten times as long
-            yield from filter(_is_tensor, (*each._parameters.values(), *each._buffers.values()))
+            own = (*each._parameters.values(), *each._buffers.values())
+            yield from (tensor for tensor in own if tensor is not None)
             yield from _tensors(tuple(each._modules.values()))
-
-
-def _is_tensor(value: Tensor | None) -> bool:
-    return value is not None
 
 
 class KeptPrecision(nn.Module):

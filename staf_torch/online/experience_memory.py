@@ -166,16 +166,11 @@ class ExperienceMemory(nn.Module):
         return (self._asked(self._weights, y) > 0).any(-1)
 
     def start(self, x: Tensor) -> Tensor:
-        """Coefficients in ``basis.local(x)`` to start from at the states x.
+        """Coefficients (..., M) or (..., P, M) in ``basis.local(x)`` to start from at x (..., n), one state
+        a memory, or (..., P, n).
 
         The blend at the centers of x, and where it does not reach one of them the nearest stored model,
         fitted as if they were values of V. NaN at a state that is not covered itself.
-
-        Args:
-            x: (..., n), one state a memory, or (..., P, n).
-
-        Returns:
-            (..., M) or (..., P, M).
         """
         trailing("ExperienceMemory.start", "x", x, dims=1, last=self.basis.dim)
         return self._asked(self._start, x)
@@ -227,14 +222,8 @@ class ExperienceMemory(nn.Module):
         return torch.where(far, 0.0, values).mT
 
     def _averaged(self, x: Tensor, model: Tensor, place: Tensor, joins: Tensor) -> tuple[Tensor, Tensor]:
-        """State and coefficients to store: the model at x, or where it joins its average with what is there.
-
-        Args:
-            x: (..., n).
-            model: coefficients, (..., M).
-            place: where it goes, (..., N) bool, one at most.
-            joins: whether that is a revisit, (...).
-        """
+        """Return state and coefficients to store in a place (..., N) bool, one at most: the model (...,
+        M) at x (..., n), or where it joins (...) its average with what is there."""
         pick = place.unsqueeze(-1).to(self.states)
         there, old = (pick * self.states).sum(-2), (pick * self.coefficients).sum(-2)
         there = torch.where(joins.unsqueeze(-1), there, x)

@@ -288,11 +288,8 @@ class StaFRegressor(StreamEstimator):
         return LocalFilter(functions, ratio, law["forgetting"], slack, law["robust"], base)
 
     def _tuned(self, streams: int, outputs: int, like: Tensor) -> Tuning | None:
-        """Return what `tune` found, for states like (n,) and where they are; None before.
-
-        Raises:
-            ValueError: if it was for other streams.
-        """
+        """Return what `tune` found, for states like (n,) and where they are; None before. Refused for
+        other streams."""
         if self._tuning is None:
             return None
         if self._tuning.sizes != (streams, len(like), outputs):

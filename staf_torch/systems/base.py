@@ -220,11 +220,7 @@ class Plant(nn.Module, metaclass=OfRows):
 
     @abc.abstractmethod
     def linearisation(self, x: Tensor | None = None, u: Tensor | None = None) -> Linearisation:
-        """A and B near a state and an input at rest, by default the equilibrium.
-
-        Args:
-            x: (n,).
-            u: (m,).
+        """A and B near a state (n,) and an input (m,) at rest, by default the equilibrium.
 
         Raises:
             ValueError: if ``dim`` is None.
@@ -235,16 +231,7 @@ class Plant(nn.Module, metaclass=OfRows):
         return wrap(x - y, self.periodic)
 
     def optimal_value(self, x: Tensor, state_cost: Tensor, input_cost: Tensor) -> Tensor | None:
-        """V*(x) for the cost x'Qx + u'Ru, where it is known.
-
-        Args:
-            x: (..., n).
-            state_cost: Q, (n, n).
-            input_cost: R, (m, m).
-
-        Returns:
-            (...), or None where it is not known.
-        """
+        """V*(x) for the cost x'Qx + u'Ru, (..., n), (n, n), (m, m) -> (...); None where it is not known."""
         return None
 
     def extra_repr(self) -> str:
@@ -303,15 +290,9 @@ class ControlAffineSystem(Plant):
         return self.drift(x) + (self.effectiveness(x) * u.unsqueeze(-2)).sum(-1)
 
     def flow(self, x: Tensor, time: Tensor) -> Tensor | None:
-        """x(t) from x(0) without control, where it is known in closed form.
-
-        Args:
-            x: x(0), (..., n).
-            time: t, (T,), in seconds, float64 on the CPU whatever x is.
-
-        Returns:
-            (..., T, n), or None where the flow is not known: it is then integrated.
-        """
+        """x(t) from x(0) without control, (..., n), (T,) -> (..., T, n), where it is known in closed
+        form; None elsewhere, where it is integrated. The times are in s, float64 on the CPU whatever x
+        is."""
         return None
 
     def smooth_drift(self, x: Tensor) -> Tensor:

@@ -180,11 +180,6 @@ class DomainProblem(NamedTuple):
 
         return supremum(error, self.offsets(degree, _FINENESS), self.radius)
 
-    def error_of(self, built: Construction, grid: Tensor) -> float:
-        """sup |V - F_m| over the balls."""
-        worst = supremum(lambda z: (self.values(z) - built(z)).abs(), grid, self.radius)
-        return _BETWEEN * float(worst.max())
-
     def construct(self, factors: tuple[Tensor, ...], degrees: tuple[int, ...]) -> Construction:
         """With the smallest m among doubled ones that leaves the error within epsilon."""
         degree = sum(degrees)
@@ -192,7 +187,8 @@ class DomainProblem(NamedTuple):
         m = math.floor(degree / self.radius) + 1
         while True:
             built = Construction(self.states, self.radius, m, factors, degrees, error=math.nan)
-            error = self.error_of(built, grid)
+            worst = supremum(lambda z, built=built: (self.values(z) - built(z)).abs(), grid, self.radius)
+            error = _BETWEEN * float(worst.max())
             if error <= self.epsilon:
                 return dataclasses.replace(built, error=error)
             if m > _LARGEST_M:
@@ -311,15 +307,7 @@ def one_polynomial_bound(
 
         Shown by `staf experiment=exponential_bound`.
 
-    Args:
-        target: V, points (..., n) to values (...).
-        domain: states that cover D, (D, n).
-        radius: r of the balls, in the units of the state.
-        epsilon: the largest error allowed, in the units of V.
-        max_degree: of the polynomial.
-
-    Raises:
-        ValueError: as `exponential_bound`.
+    Arguments and errors are those of `exponential_bound`.
     """
     refuse_rows("one_polynomial_bound", target=target)
     problem = _problem("one_polynomial_bound", target, domain, radius, epsilon, max_degree)

@@ -25,12 +25,8 @@ class DriftConstants(NamedTuple):
     """The worst over a set of states, in the norm |v|^2 = v'K(c(x))v of each.
 
     Example:
-        >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.1))
-        >>> plant = systems.Oscillator()
-        >>> states = systems.simulate(plant, torch.tensor([[1.0, 0.0]]).double(), dt=0.5, steps=12)[0]
-        >>> constants = theory.drift_constants(basis, targets.Paper(), states, plant.drift(states))
-        >>> constants.condition_number > 1, constants.speed > 0
-        (True, True)
+        >>> theory.DriftConstants(condition_number=2.0, speed=1.0, growth=0.0).speed
+        1.0
 
         Shown by `staf experiment=laws`.
     """
@@ -125,10 +121,7 @@ def ultimate_bound(
     and q times that after it: the excess is O(dt^2), where the theorem of the paper gives O(dt).
 
     Example:
-        >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.1))
-        >>> plant = systems.Oscillator()
-        >>> states = systems.simulate(plant, torch.tensor([[1.0, 0.0]]).double(), dt=0.5, steps=12)[0]
-        >>> constants = theory.drift_constants(basis, targets.Paper(), states, plant.drift(states))
+        >>> constants = theory.DriftConstants(condition_number=2.0, speed=1.0, growth=0.1)
         >>> bound = theory.ultimate_bound(constants, optim.SteepestDescent(), dt=1e-6, inner_steps=10)
         >>> bound.after < bound.before
         True
@@ -163,10 +156,7 @@ def step_for_bound(
     """The largest dt (s) whose `ultimate_bound` is at most ``excess``, after the correction or before it.
 
     Example:
-        >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.1))
-        >>> plant = systems.Oscillator()
-        >>> states = systems.simulate(plant, torch.tensor([[1.0, 0.0]]).double(), dt=0.5, steps=12)[0]
-        >>> constants = theory.drift_constants(basis, targets.Paper(), states, plant.drift(states))
+        >>> constants = theory.DriftConstants(condition_number=2.0, speed=1.0, growth=0.1)
         >>> dt = theory.step_for_bound(constants, optim.SteepestDescent(), excess=0.35, inner_steps=10)
         >>> 0 < dt < 1
         True
@@ -194,10 +184,7 @@ def steps_for_bound(
     """The fewest iterations a step whose `ultimate_bound` is at most ``excess``; None where none are enough.
 
     Example:
-        >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.1))
-        >>> plant = systems.Oscillator()
-        >>> states = systems.simulate(plant, torch.tensor([[1.0, 0.0]]).double(), dt=0.5, steps=12)[0]
-        >>> constants = theory.drift_constants(basis, targets.Paper(), states, plant.drift(states))
+        >>> constants = theory.DriftConstants(condition_number=2.0, speed=1.0, growth=0.1)
         >>> theory.steps_for_bound(constants, optim.SteepestDescent(), excess=0.35, dt=1e-6) >= 1
         True
 
@@ -238,12 +225,8 @@ class PaperStep(NamedTuple):
     """The constants of the gradient chase theorem over given states, and the step that they allow.
 
     Example:
-        >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.1))
-        >>> plant = systems.Oscillator()
-        >>> states = systems.simulate(plant, torch.tensor([[1.0, 0.0]]).double(), dt=0.5, steps=12)[0]
-        >>> found = theory.paper_step(basis, targets.Paper(), states, plant.drift(states), excess=0.35)
-        >>> 0 < found.contraction < 1, found.radius > 0
-        (True, True)
+        >>> theory.PaperStep._fields[:2]  # see `paper_step`
+        ('dt', 'contraction')
 
         Shown by `staf experiment=laws`.
     """

@@ -151,15 +151,9 @@ class AdaptiveActorCritic(Controller):
     def certain(
         self, x: Tensor, critic: Tensor, uniform: Tensor, terms: BellmanTerms, estimate: Estimate
     ) -> Tensor:
-        """Return where V^ falls at all points nearly as it should for every possible theta, (...) bool.
-
-        Args:
-            x: (..., n).
-            critic: weights of V^, (..., M).
-            uniform: draws of the extrapolated points.
-            terms: of the Bellman equation at these points, with the model of the moment.
-            estimate: theta^ with its covariance.
-        """
+        """Return where V^ of the weights ``critic`` (..., M) falls at all extrapolated points of x (...,
+        n) nearly as it should for every possible theta, (...) bool; ``terms`` are those of the Bellman
+        equation there, with the model of the moment."""
         slope = self.learner.value_gradient(x, critic, uniform)  # (..., P, n)
         points = self.learner.points(x, uniform)
         lever = (self.model.regressor(points, terms.control) * slope.unsqueeze(-1)).sum(-2)  # v, (..., P, p)

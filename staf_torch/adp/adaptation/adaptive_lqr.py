@@ -179,13 +179,8 @@ class AdaptiveLQR(Controller):
         return u, Adaptation(estimate, certain.to(x), alarmed_at, now.time + dt, window, p, belief)
 
     def doubt(self, covariance: Tensor, p: Tensor, k: Tensor) -> Tensor:
-        """c^2 sum_ij C_ij tr(W^-1 M_i W^-1 M_j) of a covariance and a design: below 1 it is certain, (...).
-
-        Args:
-            covariance: C, (..., p, p).
-            p: P of the Riccati equation, (..., n, n).
-            k: R^-1 B'P, (..., m, n).
-        """
+        """c^2 sum_ij C_ij tr(W^-1 M_i W^-1 M_j) of a covariance C (..., p, p) and a design, P (..., n, n)
+        and k = R^-1 B'P (..., m, n): below 1 it is certain, (...)."""
         r = self.cost.r.to(p)
         weight = torch.linalg.inv_ex(self.redesign.curvature.to(p) + product(product(k.mT, r), k))[0]
         slopes = self.family.a_slopes.to(p) - product(self.family.b_slopes.to(p), k.unsqueeze(-3))

@@ -81,11 +81,7 @@ class ConsiderFilter(metaclass=OfRows):
         self.process = non_negative("ConsiderFilter", "process", disturbed)
 
     def init(self, x: Tensor) -> Considered:
-        """Before the first measurement.
-
-        Args:
-            x: (..., n), for the shape alone.
-        """
+        """Return the estimate before the first measurement, a row each of (..., n)."""
         lead, n, p = x.shape[:-1], x.shape[-1], self.model.parameters_count
         return Considered(
             torch.zeros_like(x),
@@ -97,15 +93,8 @@ class ConsiderFilter(metaclass=OfRows):
         )
 
     def step(self, state: Considered, y: Tensor, u: Tensor, estimate: Estimate, dt: float) -> Considered:
-        """Return the estimate with the present measurement.
-
-        Args:
-            state: after the measurement before.
-            y: (..., n), measured now; NaN where it was not.
-            u: (..., m), held since the measurement before.
-            estimate: of theta, with its covariance.
-            dt: s since then.
-        """
+        """Return the estimate with y (..., n), measured now, NaN where it was not; u (..., m) was held
+        for dt s since the measurement before, and theta is estimated with its covariance."""
         theta = estimate.theta
         believed = self.model.believing(theta)
         if dt not in self._held:

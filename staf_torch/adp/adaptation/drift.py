@@ -141,14 +141,8 @@ class StreamDrift(metaclass=OfRows):
         return windows
 
     def step(self, estimate: DriftEstimate, equation: Equation, x: Tensor, dt: float) -> DriftEstimate:
-        """The estimate with an equation, where it is ready, and around x where that left the ball.
-
-        Args:
-            estimate: before it.
-            equation: of `window_of` this estimate.
-            x: (..., n), measured at the equation's end; of no matter where it is not ready.
-            dt: s since the step before.
-        """
+        """Return the estimate with an equation of `window_of` it, where it is ready, and around x (...,
+        n), measured at the equation's end, where that left the ball; dt in s since the step before."""
         mean, p, ready = estimate.mean, estimate.covariance, equation.ready
         scale, x = self.deviation, torch.where(ready.unsqueeze(-1), x, estimate.anchor)
         if nonzero(self.forgetting):

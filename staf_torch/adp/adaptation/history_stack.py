@@ -130,7 +130,9 @@ class HistoryStack(metaclass=OfRows):
         slots = torch.arange(self.size, device=state.s.device)
         out = (slots == (turn - 1).unsqueeze(-1)).to(state.s)  # (..., N)
         trying = _beside(turn > 0, state.gram)
-        added = torch.where(trying, _gram(state.tried_s) - _gram(_picked(out, state.s)), 0.0)
+        added = torch.where(
+            trying, _gram(state.tried_s) - _gram((_beside(out, state.s) * state.s).sum(out.dim() - 1)), 0.0
+        )
         least = torch.linalg.eigvalsh(_finite(state.gram + added))[..., 0]
         # The first place must beat the stack by a factor, every later one the best so far.
         needed = torch.where(state.place >= 0, state.best, _BETTER * state.best)
@@ -179,11 +181,6 @@ def _tried(state: Stack, equation: Equation, where: Tensor) -> Stack:
 def _beside(flags: Tensor, of: Tensor) -> Tensor:
     """Flags with as many dimensions as what they choose from."""
     return flags[(..., *[None] * (of.dim() - flags.dim()))]
-
-
-def _picked(share: Tensor, of: Tensor) -> Tensor:
-    """The sum over the places, weighted: (..., N), (..., N, *shape) -> (..., *shape)."""
-    return (_beside(share, of) * of).sum(share.dim() - 1)
 
 
 def _gram(s: Tensor) -> Tensor:

@@ -82,12 +82,7 @@ class LeastSquares(metaclass=OfRows):
         self.alarm = None if alarm is None else positive_real("LeastSquares", "alarm", alarm)
 
     def init(self, x: Tensor, theta: Tensor | None = None) -> Estimate:
-        """The first estimate, a row each of (..., n).
-
-        Args:
-            x: for the shape alone.
-            theta: (..., p), of every row; the common one by default.
-        """
+        """Return the first estimate, a row each of (..., n): theta (..., p), or the common one."""
         lead, p = x.shape[:-1], len(self.first)
         start = self.first.to(x).expand(*lead, p).clone() if theta is None else theta.to(x)
         zero = x.new_zeros(lead)
@@ -95,13 +90,8 @@ class LeastSquares(metaclass=OfRows):
         return Estimate(start, prior, zero, zero.clone(), zero.clone())
 
     def step(self, state: Estimate, equation: Equation, dt: float) -> Estimate:
-        """The estimate with an equation, where it is ready.
-
-        Args:
-            state: before it.
-            equation: S theta = z.
-            dt: s since the step before.
-        """
+        """Return the estimate with an equation S theta = z, where it is ready, dt s after the step
+        before."""
         theta, p, ready = state.theta, state.covariance, equation.ready
         equation, fine = equation.finite()
         missed = torch.zeros_like(state.resets) if state.missed is None else state.missed

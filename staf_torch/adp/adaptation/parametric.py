@@ -174,11 +174,7 @@ class ParametricPlant(ControlAffineSystem):
         return torch.stack(columns, dim=-1) if columns else x.new_zeros(*x.shape, 0)
 
     def family(self, x: Tensor | None = None, u: Tensor | None = None) -> LinearFamily:
-        """A and B of every theta at a set-point, by default the equilibrium.
-
-        Args:
-            x: (n,).
-            u: (m,).
+        """A and B of every theta at a set-point (n,), (m,), by default the equilibrium.
 
         Raises:
             ValueError: if the set-point is at rest for some theta only: the input that holds it there would
@@ -259,14 +255,8 @@ class ChangingPlant(ControlAffineSystem):
         after: Sequence[float] | Tensor | None = None,
         at: float | Tensor = 0.0,
     ) -> Tensor:
-        """The state at time 0: (B, n) -> (B, n + 2 p + 1).
-
-        Args:
-            x0: (B, n).
-            before: theta_1, (p,) or (B, p).
-            after: theta_2, likewise; None for theta_1.
-            at: s, (B,) or one number, when theta changes.
-        """
+        """The state at time 0, (B, n) -> (B, n + 2 p + 1), with theta_1 and theta_2, by default theta_1,
+        (p,) or (B, p), that takes its place ``at`` s, (B,) or one number."""
         first, last = (
             torch.as_tensor(theta, dtype=x0.dtype, device=x0.device).expand(len(x0), self.count)
             for theta in (before, before if after is None else after)
@@ -293,11 +283,7 @@ class ChangingPlant(ControlAffineSystem):
         return torch.cat((own, rest), dim=-2)
 
     def cost(self, cost: Cost) -> Cost:
-        """The cost of x alone, for this plant.
-
-        Raises:
-            ValueError: if the cost has a set-point or an output of its own.
-        """
+        """The cost of x alone, for this plant; one with a set-point or an output of its own is refused."""
         if cost.output is not None or cost.target is not None:
             raise fail("ChangingPlant", "cost", "must be of x itself at the origin", cost)
         own, wide = self.own, copied(cost)

@@ -147,7 +147,9 @@ class IntegralWindows(Windows):
     def step(self, state: Window, x: Tensor, dt: float) -> tuple[Window, Equation]:
         x, missing = _known(x if self.states is None else self.states(x), state)
         begun = state.elapsed >= 0
-        share = self._weight(state, dt) if self.smooth else torch.ones_like(state.elapsed)
+        share = torch.ones_like(state.elapsed)
+        if self.smooth:  # phi in the middle of the step
+            share = (math.pi * (state.elapsed + 0.5 * dt) / state.length).sin().square()
         share = torch.where(begun, share, 0.0)
         model, rows, half = self.model, self.model.rows, 0.5 * dt * share
         s = model.regressor(state.x, state.u) + model.regressor(x, state.u)
@@ -167,10 +169,6 @@ class IntegralWindows(Windows):
             missed=state.missed + missing.to(x),
         )
         return after, Equation(whole_s, whole_z, self._variance(state, dt), ready)
-
-    def _weight(self, state: Window, dt: float) -> Tensor:
-        """phi in the middle of the step."""
-        return (math.pi * (state.elapsed + 0.5 * dt) / state.length).sin().square()
 
     def _variance(self, state: Window, dt: float) -> Tensor:
         """Return the variance of the noise of z: sum (phi_k - phi_k-1)^2 of the noise's."""

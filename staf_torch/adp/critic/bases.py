@@ -118,7 +118,12 @@ class StaFValueBasis(ValueBasis):
         return values.squeeze(-2)
 
     def gradient(self, y: Tensor, x: Tensor) -> Tensor:
-        return self._closed_form(y, x) if self._closed else self._automatic(y, x)
+        if self._closed:
+            return self._closed_form(y, x)
+        if self.mode == "partial":
+            return jacobian(lambda at: self(at, x), y)
+        # y and x move together: the derivative along y = y0 + h, x = x0 + h.
+        return jacobian(lambda h: self(y + h, x + h), torch.zeros_like(y))
 
     def _centers(self, x: Tensor) -> Tensor:
         return x.unsqueeze(-2) + self.basis.centers.offsets(x)
@@ -135,12 +140,6 @@ class StaFValueBasis(ValueBasis):
             reach = (directions * y.unsqueeze(-2)).sum(-1, keepdim=True)  # u_i'y, (..., M, 1)
             along = along + reach * _slope(radius, x).unsqueeze(-2)
         return size * along
-
-    def _automatic(self, y: Tensor, x: Tensor) -> Tensor:
-        if self.mode == "partial":
-            return jacobian(lambda at: self(at, x), y)
-        # y and x move together: the derivative along y = y0 + h, x = x0 + h.
-        return jacobian(lambda h: self(y + h, x + h), torch.zeros_like(y))
 
 
 def _slope(radius: StateRadius, x: Tensor) -> Tensor:

@@ -79,16 +79,13 @@ class Controller(nn.Module, metaclass=OfRows):
 
     @abc.abstractmethod
     def step(self, x: Tensor, carried: Carried, uniform: Tensor, dt: float) -> tuple[Tensor, Carried]:
-        """Return the control to hold for ``dt`` seconds, and the carried state after them.
+        """Return the control u (B, m) to hold for ``dt`` seconds, and the carried state after them.
 
         Args:
             x: (B, n).
             carried: from the step before, or from `init`.
             uniform: (B, draws, n), uniform on [-1, 1].
             dt: s.
-
-        Returns:
-            u (B, m), and what the next step gets as ``carried``.
         """
 
     def recorded(self, carried: Carried) -> dict[str, Tensor]:
@@ -143,14 +140,8 @@ class Feedback(Controller):
         return self.policy(x), carried
 
     def check(self, x0: Tensor) -> None:
-        """Refuse a policy of a user that has a memory: it would remember every check that asks it, too.
-
-        Args:
-            x0: states at which it is asked, (B, n).
-
-        Raises:
-            ValueError: if a call changes a tensor that the policy holds.
-        """
+        """Refuse a policy of a user that has a memory, by a call at x0 (B, n) that changes a tensor which
+        it holds: it would remember every check that asks it, too."""
         if not is_users(type(self.policy)):
             return
         before = _tensors_of(self.policy)

@@ -167,7 +167,11 @@ class BoxDDP:
     def _best_of_several(self, x0: Tensor, terminal: LocalModel | None) -> Trajectories:
         """The cheapest trajectories of the cheapest first controls of each row."""
         b = len(x0)
-        (tried,) = numbers_of_rows(lambda: (self._first_controls(),)).numbers  # (B or 1, G, T, m)
+
+        def first() -> tuple[Tensor]:
+            return (self.problem.admissible(first_controls(self.problem, self.steps)),)
+
+        (tried,) = numbers_of_rows(first).numbers  # (B or 1, G, T, m)
         tried = tried.to(x0).expand(b, -1, -1, -1).transpose(0, 1)
         ends = over_rows(self.ends, x0) if terminal is None else terminal
         still = x0.unsqueeze(1).expand(-1, self.steps, -1)
@@ -181,9 +185,6 @@ class BoxDDP:
             found = self.solve(x0.repeat(count, 1), tried[best, rows].flatten(0, 1), None, again)
         lowest = torch.where(torch.isfinite(found.cost), found.cost, torch.inf).view(count, b)
         return rows_of(found, lowest.argmin(0) * b + rows)
-
-    def _first_controls(self) -> Tensor:
-        return self.problem.admissible(first_controls(self.problem, self.steps))
 
     def _linear(self, x0: Tensor) -> tuple[Tensor, Reference]:
         """The linear feedback of the goal as a first control of (B, n), and what it is a feedback around."""
@@ -282,14 +283,8 @@ class BoxDDP:
     def _followed(
         self, x0: Tensor, around: tuple[Tensor, ...], lengths: Tensor, terminal: End
     ) -> CostedTrajectories:
-        """The best of u = control + length change + feedback (x - state) within the bounds.
-
-        Args:
-            x0: (B, n).
-            around: state, control, change and feedback, (B, T, ...) each.
-            lengths: that are tried, (B, L).
-            terminal: V_T.
-        """
+        """Return the best of u = control + length change + feedback (x - state) within the bounds, from
+        x0 (B, n), of lengths (B, L); ``around`` is state, control, change and feedback, (B, T, ...) each."""
         start = x0.unsqueeze(1).expand(-1, lengths.shape[1], -1).contiguous()
         end, (x, u, paid) = self._forth(start, around, lengths)
         last = terminal.at(self.problem, end)  # (B, L)

@@ -214,13 +214,11 @@ class GlobalValue(KeptPrecision):
 
     @where_held("GlobalValue", _held)
     def bellman_residual(self, x: Tensor) -> Tensor:
-        """(min_u [l(x, u) + V(F(x, u))] - V(x)) / V(x) over the policy's u and the corners of the bounds.
+        """(min_u [l(x, u) + V(F(x, u))] - V(x)) / V(x) over the policy's u and the corners of the bounds, x
+        (B, n), not the goal.
 
         Near 0 where the memory knows the optimum; negative where one step of dynamic programming would
         improve V, and so V is too high at x or too low after it.
-
-        Args:
-            x: (B, n), not the goal.
         """
         found = self.choose(x)
         best = torch.full_like(found.value, torch.inf)
@@ -232,12 +230,8 @@ class GlobalValue(KeptPrecision):
     @where_held("GlobalValue", _held)
     @without_gradient("GlobalValue", "x")
     def choose(self, x: Tensor, without: Tensor | None = None) -> Choice:
-        """The best candidate at every state.
-
-        Args:
-            x: (B, n).
-            without: index of a trajectory whose models are no candidates, (B,) int64.
-        """
+        """Return the best candidate at every state x (B, n); models of the trajectory ``without`` (B,)
+        int64 are none."""
         entries = self.nearest(x, without)
         cost, control, covered = self.follow(x, entries)
         value, at = cost.min(1, keepdim=True)
@@ -285,13 +279,8 @@ class GlobalValue(KeptPrecision):
 
     @where_held("GlobalValue", _held)
     def replay(self, x: Tensor, entries: Tensor, steps: int) -> tuple[Tensor, Reference]:
-        """The stored control (B, T, m) to follow from x (B, n), and what it is a feedback around.
-
-        Args:
-            x: (B, n); the reference is turned by whole periods to where x is.
-            entries: rows of the memory, (B,).
-            steps: T.
-        """
+        """Return the stored control (B, T, m) to follow from x (B, n), of rows of the memory (B,), and
+        what it is a feedback around, turned by whole periods to where x is."""
         time = entries % self.length
         ahead = (time.unsqueeze(1) + torch.arange(steps, device=x.device)).clamp(max=self.length - 1)
         state, control, feedback = unpacked(self.problem, self.plans[(entries - time).unsqueeze(1) + ahead])

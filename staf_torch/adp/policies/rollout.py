@@ -229,12 +229,8 @@ class RolloutPolicy(nn.Module, metaclass=Rowwise):
         return space.evaluate(torch.zeros_like(x).unsqueeze(-2), coefficients).squeeze(-1)
 
     def rollout(self, x: Tensor, steps: int | None = None) -> Tensor:
-        """Cost of the base policy over the horizon, and the terminal value: (..., n) -> (...).
-
-        Args:
-            x: (..., n).
-            steps: integration steps; None for those of the policy.
-        """
+        """Cost of the base policy over the horizon, in these integration steps or those of the policy,
+        and the terminal value: (..., n) -> (...)."""
         trailing("RolloutPolicy.rollout", "x", x, 1, self.basis.dim)
         count = self.steps if steps is None else steps
         length = self.horizon / count

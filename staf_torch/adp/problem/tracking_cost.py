@@ -74,10 +74,7 @@ class TrackingCost(QuadraticCost):
     @by_rows
     def around(self, plant: Plant) -> Self:
         """This cost with the plant's bounds, periodic coordinates and resting input where it has none.
-
-        Raises:
-            ValueError: if the plant has no clock, the sizes differ, or it has no rest under the input.
-        """
+        Refused if the plant has no clock, the sizes differ, or it has no rest under the input."""
         if not isinstance(plant, Clocked):
             raise fail("TrackingCost", "plant", "must have a clock: `systems.Clocked(plant)`", plant)
         placed = copied(self)

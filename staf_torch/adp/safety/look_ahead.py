@@ -164,7 +164,9 @@ class LookAhead(nn.Module):
         later, time = torch.full_like(t, -math.inf), t + of.hold
         least = torch.where(ends.value < 0, ends.value, 0.0)
         if self.by_brakes and of.apart:
-            later = (self._stopped(ends) - least).amin(-1)
+            speed = torch.where(ends.last_rate < 0, -ends.last_rate, 0.0)
+            stopped = ends.last_value - 0.5 * speed.square() / of.brakes.to(ends.value)  # by constant brakes
+            later = (stopped - least).amin(-1)
         elif self.by_brakes:
             later = (self._braked(end, time, strength) - least).amin(-1)
         spent = None
@@ -179,12 +181,6 @@ class LookAhead(nn.Module):
             return left
         # What cannot be kept is to be over soon: the deepest point alone would let it wait outside for ever.
         return torch.where(left < -_ROUNDED, -spent - 2 * _ROUNDED, left)
-
-    def _stopped(self, ends: Ends) -> Tensor:
-        """h - margin where constant brakes have stopped: (B, k)."""
-        most = self.conditions.brakes.to(ends.value)
-        speed = torch.where(ends.last_rate < 0, -ends.last_rate, 0.0)
-        return ends.last_value - 0.5 * speed.square() / most
 
     def _braked(self, x: Tensor, t: Tensor, strength: Tensor) -> Tensor:
         """The smallest h - margin under the hardest brake until nothing comes nearer: (B, k)."""

@@ -77,10 +77,8 @@ class SafetyFilter(Controller, DecidedByRows):
 
     That is the exponential control barrier function of a control that is held: x(t + dt; u) is the plant
     itself, by Runge-Kutta steps, linearised in u where it was found, until what u must satisfy it satisfies.
-    What phi dips between the samples, which
-    its value in the middle of the hold shows, is kept as a margin, so that phi and with it h stay
-    positive in between too. In the limit of a short hold the condition is phi' >= -decay phi. The quadratic
-    program is solved exactly: in closed form for one input, else by comparing all cases.
+    What phi dips between the samples is kept as a margin, so that h stays positive in between too. In the
+    limit of a short hold the condition is phi' >= -decay phi. The quadratic program is solved exactly.
 
     Where phi < 0 <= h the condition promises nothing: the constant deceleration that stops at the edge,
     h'^2 / 2h, is asked for as well. Where bounds limit the inputs, the speed at the end of the hold must be
@@ -90,10 +88,9 @@ class SafetyFilter(Controller, DecidedByRows):
 
     Where braking along an edge drives the rest of the plant away (an unstable zero: the coordinate must first
     move the wrong way) that is logged at construction with its rate. The policy is then followed ahead for up
-    to 300 periods in place of the brakes: it is left alone where it stays inside and comes back, and else the
-    control is chosen after which it comes back with the least time integral of h < 0; `astray` marks these
-    rows. A controller that remembers is not followed: the filter acts, and the log says so. To plan with
-    `AvoidanceCost` is better there.
+    to 300 periods in place of the brakes: it is left alone where it comes back inside, and else the control
+    is chosen after which it does with the least time integral of h < 0; `astray` marks these rows. A
+    controller that remembers is not followed. To plan with `AvoidanceCost` is better there.
 
     A wanted control that satisfies everything is applied bit for bit. Bounds are hard; where they and the
     constraints contradict each other, the bounds hold, the squares of what is missing are least, and `slack`
@@ -200,13 +197,8 @@ class SafetyFilter(Controller, DecidedByRows):
 
     @classmethod
     def of_kinds(cls, filters: Sequence[SafetyFilter], rows: Sequence[Tensor], count: int) -> SafetyFilter:
-        """Return the filter of rows that are of several kinds, as their constraints and brakes are.
-
-        Args:
-            filters: of some rows each.
-            rows: of each, (R,).
-            count: B.
-        """
+        """Return the filter of B rows that are of several kinds, as their constraints and brakes are:
+        ``filters`` of some rows (R,) each."""
         kinds = kinds_of_rows(filters, rows, count)
         made: SafetyFilter = of_kinds(kinds)
         for name in ("moving", "follows", "opposed"):

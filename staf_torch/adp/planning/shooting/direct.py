@@ -52,20 +52,17 @@ class DirectShooting:
 
     Each iteration solves the linear-quadratic problem of the second-order expansion around the current
     trajectory by a backward Riccati recursion, with hard bounds a box-constrained one, and takes the longest
-    share of its step that lowers the cost, forward in time with the recursion's feedback. Where the expansion
-    has no minimum, its absolute value takes its place. The problem is solved on N / 2 intervals first and
-    then on N.
+    share of its step that lowers the cost, with the recursion's feedback. Where the expansion has no minimum,
+    its absolute value takes its place. The problem is solved on N / 2 intervals first and then on N.
 
     A row is stationary when the model promises a relative improvement of less than ``tolerance`` and the
-    control minimises the Hamiltonian in u to a share of 1e-3 of the value: a saturated control without a
-    slope does not pass. A row whose value is not near its LQR's, or is much less than the base costs, is
-    started from more guesses: constant controls at the bounds for a while, none, random splines, each
-    followed by the base policies; with bounds also the plans that `BoxDDP` reaches in equal steps from
-    holding bounds for a while. The cheapest that are no mirror images are improved. Where no two of them
-    found the same lowest value to 1e-4, with bounds and at most two states, so is the plan of a memory of the
-    plant's box (`learn_global_value`, once). A row has converged if two starts found the same, else its
-    `reason` says ``local``. A row that is not stationary is NaN, and its `reason` says why. With bounds, but
-    for a convex problem, the mesh has equal intervals; else they grow by a factor of six along it.
+    control minimises the Hamiltonian in u to a share of 1e-3 of the value; else it is NaN, and its `reason`
+    says why. A row whose value is not near its LQR's, or is much less than the base costs, is started from
+    more guesses: constant controls at the bounds for a while, none, random splines, each followed by the base
+    policies; with bounds also plans of `BoxDDP`, and where no two starts found the same lowest value to 1e-4,
+    of at most two states, that of a memory of the plant's box (`learn_global_value`, once). A row has
+    converged if two starts found the same, else its `reason` says ``local``. With bounds, but for a convex
+    problem, the mesh has equal intervals; else they grow by a factor of six along it.
 
     Every control that is found is admissible, so the value is an upper bound of V*, but for the errors of
     the Runge-Kutta steps and of the horizon, which `Optimum` reports.

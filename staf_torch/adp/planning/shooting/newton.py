@@ -148,11 +148,6 @@ def adjoint(slope: Tensor, gradient: Tensor, end: Tensor) -> Tensor:
     return torch.stack(costates[::-1], dim=1)
 
 
-def closed_stage(stage: Interval, policy: Callable[[Tensor], Tensor], x: Tensor, h: Tensor) -> Tensor:
-    """x+ under a policy that sees the state all the time, by one Runge-Kutta step: (B, n), () -> (B, n)."""
-    return runge_kutta_step(lambda at: stage.system.motion(at, policy(at)), x, float(h))
-
-
 class MeshPlan(NamedTuple):
     """Trajectories of the transcribed problem, a row each."""
 
@@ -342,7 +337,7 @@ def follow(
 
     def both(x: Tensor, k: int) -> Tensor:
         now, end, h = times[k], times[k + 1], lengths[k]
-        ahead = closed_stage(stage, lambda at: control(at, now), x, h)
+        ahead = runge_kutta_step(lambda at: stage.system.motion(at, control(at, now)), x, float(h))
         v = [stage.cost.unsaturated(control(at, t)) for at, t in ((x, now), (ahead, end - 1e-9 * float(h)))]
         return stage.admitted(torch.cat(v, dim=-1))
 
