@@ -180,6 +180,11 @@ class DomainProblem(NamedTuple):
 
         return supremum(error, self.offsets(degree, _FINENESS), self.radius)
 
+    def error_of(self, built: Construction, grid: Tensor) -> float:
+        """sup |V - F_m| over the balls."""
+        worst = supremum(lambda z: (self.values(z) - built(z)).abs(), grid, self.radius)
+        return _BETWEEN * float(worst.max())
+
     def construct(self, factors: tuple[Tensor, ...], degrees: tuple[int, ...]) -> Construction:
         """With the smallest m among doubled ones that leaves the error within epsilon."""
         degree = sum(degrees)
@@ -187,8 +192,7 @@ class DomainProblem(NamedTuple):
         m = math.floor(degree / self.radius) + 1
         while True:
             built = Construction(self.states, self.radius, m, factors, degrees, error=math.nan)
-            worst = supremum(lambda z, built=built: (self.values(z) - built(z)).abs(), grid, self.radius)
-            error = _BETWEEN * float(worst.max())
+            error = self.error_of(built, grid)
             if error <= self.epsilon:
                 return dataclasses.replace(built, error=error)
             if m > _LARGEST_M:
