@@ -57,11 +57,9 @@ class LocalFilter:
 
     The noise and the prior have scales of their own. On the stream the variance r + rho of a prediction, r
     the share of V's that is unknown, is multiplied by c^2, the running mean of the squared errors in these
-    units.
-    Away from it, where r is beyond some times its running mean, the variance goes over to that of y as r goes
-    to 1. Of an error there, c learns by the share of the variance that it makes (the expectation step of
-    Dempster, Laird and Rubin, 1977). Until y takes a second value nothing is known of its size, and
-    ``base`` says it.
+    units. Where r is beyond some times its running mean, the variance goes over to that of y as r goes to 1,
+    and c learns by the share of the variance that it makes (the expectation step of Dempster, Laird and
+    Rubin, 1977). Until y takes a second value its size is ``base``.
 
     A coordinate that is NaN was not measured and is held; a target that is NaN is not learned. A sample whose
     |y| is 1/sqrt(eps) times the largest so far, or whose local functions overflow, is skipped; a stream that

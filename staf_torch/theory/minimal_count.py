@@ -145,18 +145,8 @@ def layout_errors(
 
         Shown by `staf experiment=layouts`.
 
-    Args:
-        target: V, points (..., n) to values (...).
-        kernel: of the basis.
-        states: (..., n).
-        radius: r, positive, in the units of the state.
-        layouts: L directions (M, n).
-
-    Returns:
-        (L, ...), NaN where the target is not finite.
-
-    Raises:
-        ValueError: if an argument breaks its rule.
+    Arguments and errors are those of `minimal_count`, L layouts; the result is (L, ...), NaN where the target
+    is not finite.
     """
     refuse_rows("layout_errors", target=target, kernel=kernel, radius=radius)
     call = "layout_errors"

@@ -73,18 +73,13 @@ class AdaptiveLQR(Controller):
     ``missed``. The control is then held; with a ``filter`` it is that of the mean, as both policies see it.
 
     Example:
-        >>> def regressor(x, u):  # damping and inertia of an inverted pendulum
-        ...     zero = torch.zeros_like(u)
-        ...     return torch.stack((torch.cat((zero, -x[..., 1:]), -1), torch.cat((zero, u), -1)), dim=-1)
-        >>> def known(x, u):
-        ...     return torch.stack((x[..., 1], 9.81 * x[..., 0].sin()), dim=-1)
-        >>> plant = adp.ParametricPlant(regressor, known, dim=2, inputs=1, theta=[0.1, 1.0])
+        >>> plant = adp.ParametricPlant.of_effectiveness(systems.Pendulum())
         >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
-        >>> law = adp.LeastSquares([0.3, 0.6], deviation=[0.3, 0.5])
+        >>> law = adp.LeastSquares([0.6], deviation=0.5)  # the actuator is healthy: theta = 1
         >>> control = adp.AdaptiveLQR(plant, cost, adp.IntegralWindows(plant, 0.05), law)
         >>> run = adp.simulate(control, plant, cost, torch.tensor([[0.5, 0.0]]).double(), dt=0.02, steps=75)
         >>> run["theta"][0, -1].round(decimals=2)
-        tensor([0.1000, 1.0000], dtype=torch.float64)
+        tensor([1.], dtype=torch.float64)
 
         Shown by `staf experiment=faults`.
 

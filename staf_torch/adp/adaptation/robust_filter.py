@@ -50,21 +50,18 @@ class RobustFilter(Controller):
     unless it gave a control without the state.
 
     Example:
-        >>> def regressor(x, u):  # a trolley with unknown friction
-        ...     return torch.stack((torch.zeros_like(x[..., :1]), -x[..., 1:]), dim=-2)
-        >>> def known(x, u):
-        ...     return torch.cat((x[..., 1:], u), dim=-1)
-        >>> plant = adp.ParametricPlant(regressor, known, dim=2, inputs=1, theta=[0.5], rows=[1])
+        >>> trolley = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
+        >>> plant = adp.ParametricPlant.of_effectiveness(trolley)
         >>> def wall(x, t):
         ...     return x[:, 0] + 0.1
         >>> wanted = adp.Feedback(adp.LQR(plant, adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)))
-        >>> windows, law = adp.IntegralWindows(plant, 0.1), adp.LeastSquares([1.5], deviation=1.0)
-        >>> box = {"theta_low": [0.0], "theta_high": [3.0]}
+        >>> windows, law = adp.IntegralWindows(plant, 0.1), adp.LeastSquares([0.7], deviation=0.3)
+        >>> box = {"theta_low": [0.4], "theta_high": [1.0]}
         >>> safe = adp.RobustFilter(wanted, plant, wall, windows, law, dt=0.02, **box)
         >>> cost, x0 = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1), torch.tensor([[1.0, -2.0]]).double()
         >>> run = adp.simulate(safe, plant, cost, x0, steps=40)
         >>> bool(run["least_margin"][0, -1] > 0), run["theta"][0, -1].round(decimals=2)
-        (True, tensor([0.5000], dtype=torch.float64))
+        (True, tensor([1.], dtype=torch.float64))
 
         Shown by `tests/adp/adaptation/test_robust_filter.py`.
 

@@ -82,9 +82,7 @@ class RandomPoints(Extrapolation):
 
     Args:
         count: N, at least 1.
-        half_width: as in `Extrapolation`.
-        centers: as in `Extrapolation`.
-        around: as in `Extrapolation`.
+        half_width, centers, around: as in `Extrapolation`.
         random: ``counter``, numbers of the row's seed and the step, or ``generator``, those of a generator a
             row as before version 0.2, drawn on the CPU ahead of a loop; the latter goes with version 0.3.
 
@@ -123,9 +121,7 @@ class QuadraturePoints(Extrapolation):
     Args:
         order: points a coordinate, at least 1.
         dim: n.
-        half_width: as in `Extrapolation`.
-        centers: as in `Extrapolation`.
-        around: as in `Extrapolation`.
+        half_width, centers, around: as in `Extrapolation`.
 
     Raises:
         ValueError: if an argument breaks its rule.

@@ -58,15 +58,14 @@ class GlobalValue(KeptPrecision):
     + V_j at the end],  V_j(y) = v_j + g_j'd + d'H_j d / 2,  d = y - x_j.
 
     The memory keeps a model at every state of a library of optimal trajectories: value v, gradient g,
-    curvature H, control and feedback. At a state x the nearest of them are candidates, and so is the linear
-    feedback of the goal. Each is followed from x itself by its own time-varying feedback, within the bounds,
-    and pays what the plant then costs; the model where it ends adds the rest. The control is the first one of
-    the best candidate. Nothing is optimised at run time. A candidate that ends further than 0.3 of the region
-    from what it follows is worth the largest remembered value more.
+    curvature H, control and feedback. The nearest of them to x are candidates, and so is the linear feedback
+    of the goal. Each is followed from x by its own feedback, within the bounds, and pays what the plant then
+    costs; the model where it ends adds the rest. The control is the first one of the best candidate: nothing
+    is optimised at run time. One that ends further than 0.3 of the region from what it follows is worth the
+    largest remembered value more.
 
-    The nearest have the least d'Gd, d = x - x_j the shorter way around. G is the mean of |H_j|, H_j with the
-    absolute values of its eigenvalues: far is what costs. By distances in units of the region a cart-pole
-    needs a thousand candidates in place of 64.
+    The nearest have the least d'Gd, d the shorter way around, G the mean of |H_j|: far is what costs. By
+    distances in units of the region a cart-pole needs a thousand candidates in place of 64.
 
     Example:
         >>> def step(x, u):  # a cart without friction, for 0.1 s

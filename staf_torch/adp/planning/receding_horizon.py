@@ -69,13 +69,11 @@ class RecedingHorizon(Controller):
         steps: T.
         iterations: of a period; the first plan takes as many as it needs, up to 60. 0: the first plan alone
             is followed, with its feedback and then with that of the goal, in some 50 us a control; let
-            ``steps`` be the whole episode then. With a memory that plan is the best that `BoxDDP` reaches
-            from several of the memory's, also after holding a bound for a while.
+            ``steps`` be the whole episode then.
         memory: for V_T and the plan to begin from; None for the linear feedback and the last plan.
         held: whether the first plan is the best of several, begun also from holding each corner of the
-            bounds for 2 to 30 periods before the linear feedback, not from this feedback alone: where the
-            bounds are met there are several ways to the goal, and the plan of a period before decides which
-            one is gone. Without a memory, which has its own.
+            bounds for 2 to 30 periods before the linear feedback: the first plan decides which of several
+            ways to the goal is gone. Without a memory, whose first plans are the best of several.
         compile: as in `BoxDDP`.
 
     Raises:

@@ -63,12 +63,10 @@ class Holding:
 
     A plant in continuous time is integrated in equal steps of fourth order, and its cost rate with it: one
     classical Runge-Kutta step where it takes a fifth of the fastest time constant at most and its error is
-    some 1e-6 of the state, else more of them or exponential
-    steps around the linearisation, which solve its fast modes exactly: what is less work. A linear plant with
-    a quadratic cost takes one exponential step, which is exact. The number is chosen once, by step doubling
-    on states around the set-point (within the plant's ``spread``) and inputs within the bounds.
-    A plant in discrete time takes its own steps, each of which pays its period times the cost rate at its
-    start.
+    some 1e-6 of the state, else more of them or exponential steps around the linearisation, which solve its
+    fast modes exactly: what is less work. The number is chosen once, by step doubling on states around the
+    set-point (within the plant's ``spread``) and inputs within the bounds. A plant in discrete time takes
+    its own steps, each of which pays its period times the cost rate at its start.
 
     Args:
         call: whose argument ``dt`` is, for messages.

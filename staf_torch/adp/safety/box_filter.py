@@ -46,18 +46,15 @@ class BoxFilter(nn.Module, metaclass=OfRows):
 
     the second where inputs move the speed of a coordinate (relative degree two) and that of now does not use
     up d(0) within the hold: the next hold can stop it, and a third of d(0) is left. Where no control leaves
-    half of every distance a thousandth has to do. x(t) is that of the plant whose control is held, by two
-    Runge-Kutta steps and Hermite's cubic between. Distances are those of s, with all digits also beside a
-    wall. A wanted control that satisfies everything is applied bit for bit.
+    half of every distance a thousandth has to do. x(t) is that of the plant, by two Runge-Kutta steps and
+    Hermite's cubic between; distances are those of s, with all digits also beside a wall. A wanted control
+    that satisfies everything is applied bit for bit.
 
-    With the control held for ``dt`` not every state can be kept: at 1e-6 from a wall and heading for it every
-    admissible control carries the plant out, or through another wall; `share` says so. Where inputs have no
-    bounds that is a matter of ``dt`` alone: with ``renewed=True`` a control is held for half the time to the
-    next wall, if that is less, and stops the coordinate by then. `simulate(..., substeps=16, renew=True)`
-    renews it like that within ``dt``: as close to a control in continuous time as the state asks for.
-
-    One hold is looked ahead. A policy that brakes by itself, the LQR of s, is kept wherever a control exists;
-    one that never does, u = 0, comes to corners where the walls of two coordinates contradict each other.
+    Not every state can be kept: at 1e-6 from a wall and heading for it every admissible control carries the
+    plant out, or through another wall; `share` says so. Where inputs have no bounds that is a matter of
+    ``dt`` alone: with ``renewed`` a control is held for half the time to the next wall, if that is less;
+    `simulate(..., substeps=16, renew=True)` renews it like that within ``dt``. One hold is looked ahead: a
+    policy that never brakes, u = 0, comes to corners where the walls of two coordinates contradict.
 
     Example:
         >>> box = systems.Barrier(systems.TwoStateChain(), low=[-7.0, -5.0], high=[5.0, 7.0])
