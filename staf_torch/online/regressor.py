@@ -192,10 +192,7 @@ class StaFRegressor(StreamEstimator):
         """
         states, values = pair(f"{_NAME}.smooth", x, y, (2, 3))
         states = turned_in_time(states, self._angles(states.shape[-1]))
-        steps, twin = lapses(f"{_NAME}.smooth", time, states), self._twin()
-        twin._prepare(states[0], values[0])
-        streams = twin._streams_.inner if isinstance(twin._streams_, TurningStreams) else twin._streams_
-        assert isinstance(streams, FilterStreams)
+        steps, streams = lapses(f"{_NAME}.smooth", time, states), self._fresh_streams(states[0], values[0])
         rows = (len(states), streams.count, -1)
         whole = states.new_ones(rows[:2], dtype=torch.float64) if steps is None else steps.expand(rows[:2])
         both = torch.cat((states.double().reshape(rows), values.double().reshape(rows)), -1)
@@ -242,7 +239,8 @@ class StaFRegressor(StreamEstimator):
         of = values.double().reshape(*at.shape[:2], -1)
         count, outputs = of.shape[1:]
         with torch.no_grad():
-            center, spread = self._units(at, of, states, values)
+            streams = self._fresh_streams(states[0], values[0])
+            center, spread = streams.units_for(torch.cat((at, of), -1))
         late = at.new_ones(at.shape[:2]) if steps is None else steps.expand(at.shape[:2])
         sides = [part.transpose(0, 1) for part in ((at - center[:, :n]) / spread[:, :n], late)]
         goal = ((of - center[:, n:]) / spread[:, n:]).transpose(0, 1)
@@ -256,13 +254,13 @@ class StaFRegressor(StreamEstimator):
         typed = [part.to(values.dtype) for part in parts]
         return Forecast(*(part if part.requires_grad else like_given(y, part) for part in typed))
 
-    def _units(self, at: Tensor, of: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        """Return centers and spreads (S, n + K) of a record: 0 and 1 where there are no units."""
+    def _fresh_streams(self, x: Tensor, y: Tensor) -> FilterStreams:
+        """Return streams that have learned nothing, for samples like these, which are not turned."""
         twin = self._twin()
-        twin._prepare(x[0], y[0])
+        twin._prepare(x, y)
         streams = twin._streams_.inner if isinstance(twin._streams_, TurningStreams) else twin._streams_
         assert isinstance(streams, FilterStreams)
-        return streams.units_for(torch.cat((at, of), -1))
+        return streams
 
     def _recorded_filter(self, streams: int, outputs: int, like: Tensor) -> LocalFilter:
         """Return the filter of tensors that autograd sees, for states like (n,)."""
@@ -275,8 +273,7 @@ class StaFRegressor(StreamEstimator):
             return LocalFilter(tuned, found.ratio, found.forgetting, slack, robust)
         law = own_law(_NAME, {name: getattr(self, name) for name in NAMES}, torch.float64, streams, like)
         kernel = self.kernel if isinstance(self.kernel, Kernel) else _kernel(self.kernel)
-        rate, ratio = kernel.exponent_rate(), (law["noise"] / law["amplitude"]).square()
-        slack, base = (law["follow"] * law["radius"]).detach(), law["amplitude"].square()
+        rate = kernel.exponent_rate()
         plain = kernel.state_free and rate is not None and kernel.log_gain(toward[:1]) is None
         functions: OwnFunctions | LocalFunctions
         if plain or isinstance(self.radius, RowNumbers):
@@ -285,7 +282,7 @@ class StaFRegressor(StreamEstimator):
             if like.device != device_of(kernel) and not any(p.requires_grad for p in kernel.parameters()):
                 kernel = copy.deepcopy(kernel).to(like.device)
             functions = LocalFunctions.of(kernel, law["radius"][0] * toward)
-        return LocalFilter(functions, ratio, law["forgetting"], slack, law["robust"], base)
+        return _own_filter(law, functions)
 
     def _tuned(self, streams: int, outputs: int, like: Tensor) -> Tuning | None:
         """Return what `tune` found, for states like (n,) and where they are; None before. Refused for
@@ -319,7 +316,11 @@ class StaFRegressor(StreamEstimator):
         kernel, numbers = _kernel(self.kernel), {name: getattr(self, name) for name in NAMES}
         refuse_gradient(_NAME, **numbers)
         if found is None and has_rows(numbers, kernel):
-            return self._own_filters(kernel, numbers, toward, streams, outputs, like)
+            own = own_law(_NAME, numbers, dtype, streams, like)
+            filter_ = _own_filter(own, own_functions(_NAME, kernel.to(like.device), own["radius"], toward))
+            self.centers_offsets_ = own["radius"][:, None, None] * toward
+            state = StreamState.empty(like, streams, dim, len(toward), outputs)
+            return FilterStreams(filter_, state, scaling)
         robust = math.inf if self.robust is None else positive_real(_NAME, "robust", single(self.robust))
         if found is not None:
             self.centers_offsets_ = found.radius[0] * toward
@@ -339,24 +340,6 @@ class StaFRegressor(StreamEstimator):
         base = float(single(self.amplitude)) ** 2
         filter_ = LocalFilter(functions, ratio, forgetting, follow * radius, robust, base)
         return FilterStreams(filter_, StreamState.empty(like, streams, dim, len(offsets), outputs), scaling)
-
-    def _own_filters(
-        self,
-        kernel: Kernel,
-        numbers: dict[str, Any],
-        toward: Tensor,
-        streams: int,
-        outputs: int,
-        like: Tensor,
-    ) -> FilterStreams:
-        law = own_law(_NAME, numbers, like.dtype, streams, like)
-        functions = own_functions(_NAME, kernel.to(like.device), law["radius"], toward)
-        self.centers_offsets_ = law["radius"][:, None, None] * toward
-        ratio = (law["noise"] / law["amplitude"]).square()
-        slack, base = law["follow"] * law["radius"], law["amplitude"].square()
-        filter_ = LocalFilter(functions, ratio, law["forgetting"], slack, law["robust"], base)
-        state = StreamState.empty(like, streams, len(like), len(toward), outputs)
-        return FilterStreams(filter_, state, flag(_NAME, "scaling", self.scaling))
 
     def _law(self, dtype: torch.dtype) -> tuple[float, float]:
         """Return the checked variance of the noise in units of the process's, and the forgetting."""
@@ -411,6 +394,13 @@ class StaFRegressor(StreamEstimator):
                 f"`{_NAME}.load_state_dict(state=...)` must be what `state_dict` returned; {told}."
             )
         self._tuning = None if found is None else Tuning(**found)
+
+
+def _own_filter(law: dict[str, Tensor], functions: OwnFunctions | LocalFunctions) -> LocalFilter:
+    """Return the filter of numbers as `own_law` returns them."""
+    ratio, slack = (law["noise"] / law["amplitude"]).square(), (law["follow"] * law["radius"]).detach()
+    base = law["amplitude"].square()
+    return LocalFilter(functions, ratio, law["forgetting"], slack, law["robust"], base)
 
 
 def _check_reach(functions: LocalFunctions, radius: float) -> None:
