@@ -13,7 +13,7 @@ from ...approximation.basis import StaFBasis
 from ...centers import StateRadius
 from ...kernels import AnchoredKernel, ExponentialKernel
 from ...lanes.per_row.objects import OfRows
-from ...numerics.checks import choice, flag, integer, positive_real
+from ...numerics.checks import choice, flag, hold, integer, positive_real
 from ...numerics.default_device import device_of
 from ...numerics.derivatives import jacobian
 
@@ -169,10 +169,8 @@ class QuadraticBasis(ValueBasis):
         self.dim = integer("QuadraticBasis", "dim", dim, least=1)
         rows, columns = torch.triu_indices(dim, dim, device="cpu")
         identity = torch.eye(dim, dtype=torch.float64, device="cpu")
-        self.register_buffer("left", identity[rows])  # (M, n)
-        self.register_buffer("right", identity[columns])
-        self.left: Tensor
-        self.right: Tensor
+        self.left = hold(self, "left", identity[rows])  # (M, n)
+        self.right = hold(self, "right", identity[columns])
         self.count = len(rows)
 
     def forward(self, y: Tensor, x: Tensor) -> Tensor:
@@ -226,13 +224,11 @@ class RBFGridBasis(ValueBasis):
         self.width = spacing if width is None else positive_real("RBFGridBasis", "width", width)
         line = torch.linspace(-side, side, points, dtype=torch.float64, device="cpu").tolist()
         grid = torch.tensor(list(itertools.product(line, repeat=dim)), dtype=torch.float64, device="cpu")
-        self.register_buffer("centers", grid)  # (M, n)
+        self.centers = hold(self, "centers", grid)  # (M, n)
         self.anchor: Tensor
         self.register_buffer("anchor", (-0.5 * grid.square().sum(-1) / self.width**2).exp())
         slope = self.anchor.unsqueeze(-1) * grid / self.width**2  # grad k_i(0), (M, n)
-        self.register_buffer("slope", slope if flag("RBFGridBasis", "flat", flat) else 0 * slope)
-        self.centers: Tensor
-        self.slope: Tensor
+        self.slope = hold(self, "slope", slope if flag("RBFGridBasis", "flat", flat) else 0 * slope)
         self.count = len(grid)
 
     def forward(self, y: Tensor, x: Tensor) -> Tensor:

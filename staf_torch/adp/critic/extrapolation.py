@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from ...centers import ConstantRadius, Radius
 from ...lanes.per_row.objects import OfRows
-from ...numerics.checks import choice, integer, positive
+from ...numerics.checks import choice, hold, integer, positive
 
 
 class Extrapolation(nn.Module, metaclass=OfRows):
@@ -146,9 +146,8 @@ class QuadraturePoints(Extrapolation):
         products = torch.tensor(
             list(itertools.product(masses.tolist(), repeat=dim)), dtype=torch.float64, device="cpu"
         )
-        self.register_buffer("grid", grid)  # (N, n)
+        self.grid = hold(self, "grid", grid)  # (N, n)
         self.register_buffer("weights", products.prod(-1) / 2**dim)
-        self.grid: Tensor
         self.count = len(grid)
 
     def cube(self, uniform: Tensor) -> Tensor:

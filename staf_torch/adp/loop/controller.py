@@ -17,7 +17,7 @@ from ...lanes.per_row.objects import OfRows
 from ...lanes.row_numbers import over_rows
 from ...lanes.threads import small
 from ...lanes.trace.loops import where_rows
-from ...numerics.checks import fail, real, trailing
+from ...numerics.checks import fail, hold, real, trailing
 from ...numerics.default_device import beside
 from ...numerics.linalg import riccati
 from ...numerics.repr_text import limits, shown
@@ -255,10 +255,8 @@ class LQR(nn.Module, metaclass=OfRows):
             p, k = held_riccati(system, still, self.period)
         if clock := self.cost.dim - len(p):
             p, k = pad(p, (0, clock, 0, clock)), pad(k, (0, clock))
-        self.register_buffer("p", p)
-        self.register_buffer("k", k)
-        self.p: Tensor
-        self.k: Tensor
+        self.p = hold(self, "p", p)
+        self.k = hold(self, "k", k)
         self._size = k.shape[-1]
 
     def forward(self, x: Tensor) -> Tensor:

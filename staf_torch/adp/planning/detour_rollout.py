@@ -12,6 +12,7 @@ from torch import Tensor
 from ...lanes import compiled, each, repeat
 from ...numerics.checks import (
     fail,
+    hold,
     integer,
     non_negative,
     one_or_each,
@@ -131,14 +132,11 @@ class DetourRollout(Controller):
         positive("DetourRollout", "sizes", large)
         long = [integer("DetourRollout", "lengths", length, least=1) for length in lengths]
         device = device_of(plant)
-        self.register_buffer("axes", along.clone().to(device))
-        self.register_buffer("margin", kept.to(device))
+        self.axes = hold(self, "axes", along.clone().to(device))  # (k, n)
+        self.margin = hold(self, "margin", kept.to(device))
         self.register_buffer("fresh", _detours(len(along), large, long).to(device))
-        self.register_buffer("changes", _changes(len(along)).to(device))
-        self.axes: Tensor  # (k, n)
-        self.margin: Tensor
+        self.changes = hold(self, "changes", _changes(len(along)).to(device))  # (C, k + 1)
         self.fresh: Tensor  # (P, k + 1), the length last
-        self.changes: Tensor  # (C, k + 1)
         self.holding = Holding("DetourRollout", plant, self.cost, self.stride * self.hold)
 
     def init(self, x0: Tensor) -> Detour:

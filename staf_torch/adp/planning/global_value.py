@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ...lanes import Program, scan
 from ...lanes.gradients import without_gradient
-from ...numerics.checks import fail, integer, positive, positive_real, trailing, vector
+from ...numerics.checks import fail, hold, integer, positive, positive_real, trailing, vector
 from ...numerics.default_device import KeptPrecision, where_held
 from ..problem.rules import check_endless, check_regulator
 from ..problem.sampled import SampledProblem
@@ -114,22 +114,17 @@ class GlobalValue(KeptPrecision):
         width = half_widths("GlobalValue", region, problem.dim)
         self.lookahead = integer("GlobalValue", "lookahead", lookahead, least=1)
         self.spacing = positive_real("GlobalValue", "spacing", spacing)
-        self.register_buffer("region", width)
-        self.region: Tensor
+        self.region = hold(self, "region", width)
         arrives = library.value[:, -1] <= _ARRIVED * library.cost + 1e-9
         self.arrives = arrives & torch.isfinite(library.cost)
         if not bool(self.arrives.any()):
             raise fail("GlobalValue", "library", "must have a trajectory that arrives at the goal", None)
         self.length = library.control.shape[1] + lookahead + 1  # rows of a trajectory in the tables
-        self.register_buffer("plans", self._plans())  # (state, control, feedback), (N length, n + m + m n)
-        self.register_buffer("models", self._models())  # (state, v, g, H), (N length, n + 1 + n + n n)
-        self.plans: Tensor
-        self.models: Tensor
-        self.register_buffer("entries", self._searched())  # rows that are searched, (J,)
-        self.entries: Tensor
+        self.plans = hold(self, "plans", self._plans())  # (state, control, feedback), (N length, n + m + m n)
+        self.models = hold(self, "models", self._models())  # (state, v, g, H), (N length, n + 1 + n + n n)
+        self.entries = hold(self, "entries", self._searched())  # rows that are searched, (J,)
         self.candidates = min(integer("GlobalValue", "candidates", candidates, least=1), len(self.entries))
-        self.register_buffer("frame", self._frame())  # F with F F' = G, (n, n)
-        self.frame: Tensor
+        self.frame = hold(self, "frame", self._frame())  # F with F F' = G, (n, n)
         self._said = False  # that states are not covered
         self._judge = Program(self._judged, name="a global value", copies=1)
         self._ready()

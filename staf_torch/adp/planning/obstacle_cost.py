@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ...lanes.per_row.objects import made_by_rows
 from ...lanes.row_numbers import all_rows, over_rows, points_of_rows
-from ...numerics.checks import choice, fail, integer, object_of, positive_real
+from ...numerics.checks import choice, fail, hold, integer, object_of, positive_real
 from ...numerics.linalg import Matrix
 from ...numerics.row_checks import check_rows
 from ...signs import Sign
@@ -84,10 +84,8 @@ class AvoidanceCost(QuadraticCost):
         self.reach = positive_real("AvoidanceCost", "reach", reach)
         self.kind = choice("AvoidanceCost", "kind", kind, ("penalty", "log"))
         heavy = positive_real("AvoidanceCost", "weight", weight)
-        self.register_buffer("weight", self.q.new_tensor(heavy))
-        self.register_buffer("edge", self.q.new_tensor(_EDGE))
-        self.weight: Tensor
-        self.edge: Tensor
+        self.weight = hold(self, "weight", self.q.new_tensor(heavy))
+        self.edge = hold(self, "edge", self.q.new_tensor(_EDGE))
 
     def state_rate(self, x: Tensor) -> Tensor:
         """e'Qe and what the obstacles add: (..., n) -> (...)."""

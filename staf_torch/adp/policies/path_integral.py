@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ...lanes import Program, scan
 from ...lanes.tree import Tree
-from ...numerics.checks import fail, integer, one_or_each, positive, positive_real, trailing
+from ...numerics.checks import fail, hold, integer, one_or_each, positive, positive_real, trailing
 from ...numerics.default_device import device_of, where_held
 from ..loop.controller import Controller
 from ..problem.sampled import SampledProblem, goal_of
@@ -90,13 +90,10 @@ class PathIntegral(Controller):
         else:
             scale = positive("PathIntegral", "noise", one_or_each("PathIntegral", "noise", noise, m))
         device = device_of(problem)
-        self.register_buffer("noise", scale.to(device))
-        self.noise: Tensor
-        self.register_buffer("spread", _hats(self.steps, self.knots).to(device))  # (T, knots)
-        self.spread: Tensor
+        self.noise = hold(self, "noise", scale.to(device))
+        self.spread = hold(self, "spread", _hats(self.steps, self.knots).to(device))  # (T, knots)
         scales = torch.logspace(0, math.log10(_FINEST), self.samples, dtype=torch.float64, device="cpu")
-        self.register_buffer("scales", scales.to(device))  # (S,)
-        self.scales: Tensor
+        self.scales = hold(self, "scales", scales.to(device))  # (S,)
         self.draws = -(-self.samples * self.knots * m // n)
         self._roll = Program(self._rolled, name="sampled plans", compile=compile)
 

@@ -17,7 +17,7 @@ from ...lanes.gradients import defer_gradient, marked
 from ...lanes.per_row.objects import Rowwise
 from ...lanes.trace.loops import repeat_counted
 from ...numerics.box import LARGEST, box_minimum
-from ...numerics.checks import fail, integer, positive_real, trailing
+from ...numerics.checks import fail, hold, integer, positive_real, trailing
 from ...numerics.default_device import KeptPrecision, beside, device_of
 from ...systems import Bounds, Plant, StepPlant
 from ...systems.black_box import Numbers
@@ -125,8 +125,7 @@ class SampledRollout(KeptPrecision, metaclass=Rowwise):
         self.metric: Tensor
         self.bounds = Bounds(None, None, cost.inputs) if cost.bounds is None else cost.bounds
         span = self.bounds.high - self.bounds.low
-        self.register_buffer("probe", _PROBE * torch.where(torch.isfinite(span), span, 1.0))  # (m,)
-        self.probe: Tensor
+        self.probe = hold(self, "probe", _PROBE * torch.where(torch.isfinite(span), span, 1.0))  # (m,)
         self.along = None if basis.dim == cost.dim else _along(basis)
         self._followed = followed(plant, base, self.bounds, self.period)
 

@@ -18,7 +18,7 @@ from ...lanes.per_row.decisions import in_any_row
 from ...lanes.per_row.each_row import first_row
 from ...lanes.per_row.objects import Note, OfRows
 from ...numerics.angles import turned, unwrapped, wrap
-from ...numerics.checks import fail, integer, trailing
+from ...numerics.checks import fail, hold, integer, trailing
 from ...numerics.default_device import beside, device_of
 from ...numerics.derivatives import use_forward_mode
 from ...numerics.linalg import Matrix, discrete_riccati, positive_semidefinite, square, unstabilisable_mode
@@ -128,10 +128,8 @@ class SampledProblem(nn.Module, metaclass=OfRows):
             p, k = self._regulator(at)
         except ValueError as error:
             self.unregulated = Note(error)
-        self.register_buffer("p", p)
-        self.register_buffer("k", k)
-        self.p: Tensor
-        self.k: Tensor
+        self.p = hold(self, "p", p)
+        self.k = hold(self, "k", k)
         self.endless = terminal is None
         self.end_value = terminal if callable(terminal) else None
         self.register_buffer("end", self._end(terminal))
