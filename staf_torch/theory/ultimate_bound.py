@@ -121,7 +121,7 @@ def ultimate_bound(
     and q times that after it: the excess is O(dt^2), where the theorem of the paper gives O(dt).
 
     Example:
-        >>> constants = theory.DriftConstants(condition_number=2.0, speed=1.0, growth=0.1)
+        >>> constants = theory.DriftConstants(condition_number=50.0, speed=10.0, growth=0.1)
         >>> bound = theory.ultimate_bound(constants, optim.SteepestDescent(), dt=1e-6, inner_steps=10)
         >>> bound.after < bound.before
         True
@@ -156,7 +156,7 @@ def step_for_bound(
     """The largest dt (s) whose `ultimate_bound` is at most ``excess``, after the correction or before it.
 
     Example:
-        >>> constants = theory.DriftConstants(condition_number=2.0, speed=1.0, growth=0.1)
+        >>> constants = theory.DriftConstants(condition_number=50.0, speed=10.0, growth=0.1)
         >>> dt = theory.step_for_bound(constants, optim.SteepestDescent(), excess=0.35, inner_steps=10)
         >>> 0 < dt < 1
         True
@@ -184,7 +184,7 @@ def steps_for_bound(
     """The fewest iterations a step whose `ultimate_bound` is at most ``excess``; None where none are enough.
 
     Example:
-        >>> constants = theory.DriftConstants(condition_number=2.0, speed=1.0, growth=0.1)
+        >>> constants = theory.DriftConstants(condition_number=50.0, speed=10.0, growth=0.1)
         >>> theory.steps_for_bound(constants, optim.SteepestDescent(), excess=0.35, dt=1e-6) >= 1
         True
 
