@@ -65,7 +65,7 @@ def rates_of(system: Plant, lqr: LQR) -> tuple[Tensor, Tensor]:
 
 def regulator(system: Plant, cost: Cost, horizon: float | None, ends: bool) -> LQR | None:
     """Return the LQR of a problem; None where there is none and a horizon, s, does without, with a
-    warning if a plan ``ends`` with its value. Neither an LQR nor a horizon is refused."""
+    warning if a plan ``ends`` with its value. Refused where there is neither."""
     try:
         decided(lambda: check_regulates("DirectShooting", system, cost))
         return LQR(system, cost)
