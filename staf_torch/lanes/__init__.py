@@ -1,4 +1,14 @@
-"""Row programs: torch functions of one row, compiled with a row in every vector lane."""
+"""Row programs: torch functions of one row, compiled with a row in every vector lane.
+
+Every room imports those before it. `tree` and `row_numbers` are what all inputs are made of, `dependencies`
+is what a step reads and whether it has changed, `threads` has locks, `compilation` the compiler and its
+cache. `calls` checks inputs, chooses between compiled code and plain torch, and prepares calls. `trace`
+writes a step down as a scalar program, `emit` makes C++, C or CUDA of it, `device` runs kernels,
+`trace_files` keeps traces. `adjoint` has gradients. `program` brings these together; `shared_programs`,
+`row_functions`, `loop_program`, `compiled_methods` are programs for many objects, functions, loops and
+methods. Beside them stand `per_row`, objects whose numbers differ from row to row, and `torch_compile`,
+calls within somebody's `torch.compile`.
+"""
 
 from . import device as device
 from .adjoint.gradient_call import gradient_memory as gradient_memory

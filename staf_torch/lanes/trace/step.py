@@ -27,7 +27,6 @@ from .entrywise import RULES
 from .graph import NOW, STEP, Graph, Sizes
 from .indexing import CHOICES, MOVEMENTS, added_at, many, moved
 from .loops import tracing
-from .matrix_exponential import matrix_exponential
 from .tracer import NotLoweredError, Tracer
 
 RULES["scatter_add"] = added_at
@@ -276,6 +275,5 @@ FACTORISATIONS: dict[str, Callable[..., Any]] = {
     "_linalg_solve_ex": factorisations.solve,
     "linalg_lu_solve": factorisations.solve_again,
     "linalg_qr": factorisations.orthogonal,
-    "linalg_matrix_exp": matrix_exponential,
     "_linalg_eigh": eigenvalues.eigen,
 }

@@ -26,7 +26,6 @@ from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_mod
 from .captured_tensors import Captured
 from .captured_tensors import tensors as _tensors
 from .graph import FLAG, NARROW, REAL, ROW, WHOLE, WIDE, Graph, Ids
-from .substitutes import instead_of
 
 _OWN = (str(Path(__file__).parent.parent), str(Path(torch.__file__).parent))
 _LINE = 120  # letters of a line of code in the log
@@ -35,6 +34,34 @@ _READS = ("_local_scalar_dense", "equal", "is_nonzero", "nonzero", "allclose", "
 
 _RESHAPED = ("squeeze_", "unsqueeze_", "transpose_", "t_", "as_strided_")  # the same memory seen otherwise
 _BLANK = ("zeros_like", "ones_like", "full_like", "new_zeros", "new_ones", "new_full")  # whatever the values
+_CHOOSE = "write `torch.where(condition, a, b)`, or `lanes.repeat(..., where=)` for a loop that rows leave"
+_MASKED = "write `y = torch.where(mask, new, y)`: how many entries a mask takes is the row's own"
+_LEAST_SQUARES = "write `torch.linalg.solve(A.mT @ A, A.mT @ b)`, if the columns are independent"
+_GRAM = "write `torch.linalg.eigh(A.mT @ A)`: its roots are the singular values"
+_SLIDING = "write `(x.unfold(-1, width, stride) * weights).sum(-1)`"
+_BITS = "write `%`, `//` and comparisons, or keep flags as bool"
+_TORCH = "write it with torch, `torch.sin` for `math.sin` or `numpy.sin`"
+_DRAWN = "draw the numbers before, and give them to every step as inputs of the times (`now`)"
+_REAL = "keep the real and the imaginary part as two real tensors"
+_INSTEAD: dict[str, str] = {
+    **dict.fromkeys(("_local_scalar_dense", "is_nonzero", "equal", "allclose"), _CHOOSE),
+    **dict.fromkeys(("nonzero", "masked_select", "masked_scatter", "index", "index_put"), _MASKED),
+    **dict.fromkeys(("linalg_lstsq", "linalg_pinv"), _LEAST_SQUARES),
+    "_linalg_svd": _GRAM,
+    "linalg_eig": "write `torch.linalg.eigh`, if the matrix is symmetric",
+    "linalg_lu_factor_ex": "write `torch.linalg.solve`",
+    **dict.fromkeys(("convolution", "avg_pool2d", "max_pool2d_with_indices"), _SLIDING),
+    **dict.fromkeys(("__lshift__", "__rshift__", "bitwise", "gcd"), _BITS),
+    **dict.fromkeys(("numpy", "__array__", "tolist", "__dlpack__"), _TORCH),
+    **dict.fromkeys(("_fft_r2c", "_fft_c2c", "_fft_c2r"), "write the sums of cosines and sines"),
+    "gather": "write `gather`, `torch.take_along_dim` or `scatter` along one dimension",
+    "scatter_add": "write `scatter_add` along one dimension",
+    "scatter_reduce": "write `torch.where(index == k, value, ...)` and `amax` over the entries",
+    "random": _DRAWN,
+    "complex": _REAL,
+    "half": "compute in float32 or float64: `.float()` or `.to(x.dtype)`",
+}
+"""What to write in place of an operation without a scalar form, for the line of the log that names one."""
 
 
 class NotLoweredError(Exception):
@@ -43,11 +70,11 @@ class NotLoweredError(Exception):
 
     Args:
         reason: names the operation.
-        name: of it among the `substitutes`.
+        name: of it among those for which something else can be written.
     """
 
     def __init__(self, reason: str, name: str = "") -> None:
-        instead = instead_of(name)
+        instead = _INSTEAD.get(name, "")
         super().__init__(f"{reason}{_where(traceback.extract_stack())}{'; ' + instead if instead else ''}")
 
 
@@ -69,7 +96,7 @@ def explained(error: RuntimeError, call: str) -> Exception:
         return error
     where = _where(traceback.extract_tb(error.__traceback__))
     return ValueError(
-        f"numbers leave torch{where}, in a function of which derivatives are taken; {instead_of('numpy')} "
+        f"numbers leave torch{where}, in a function of which derivatives are taken; {_INSTEAD['numpy']} "
         f"({error})."
     )
 
