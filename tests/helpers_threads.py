@@ -61,14 +61,9 @@ def _ready(policy: Any) -> Any:
     return policy
 
 
-def _several(model: Any, k: int) -> Tensor:
-    return torch.stack(model.predict(X[k % 8 : k % 8 + 32], return_std=True))
-
-
 OBJECTS = {
     "filter": Crowded(lambda: _fitted(st.StaFRegressor(radius=0.3)), _told, _taught),
     "filter of an angle": Crowded(lambda: _fitted(st.StaFRegressor(periodic=[0])), _told, _taught),
-    "filter at points": Crowded(lambda: _fitted(st.StaFRegressor(radius=0.3)), _several, _taught),
     "mixture": Crowded(lambda: _fitted(MixtureRegressor(128, 8)), _told, _taught),
     "memory": Crowded(_memory, lambda memory, k: memory.query(X[:3]), _stored),
     "program": Crowded(

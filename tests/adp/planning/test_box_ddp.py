@@ -12,7 +12,7 @@ from helpers import uniform
 from helpers_swingup import cost_of, double_integrator, pendulum
 from torch import Tensor
 
-from staf_torch import adp, lanes, systems
+from staf_torch import adp, systems
 from staf_torch.adp.planning.trajectories import Reference, rows_of
 from staf_torch.numerics.derivatives import use_forward_mode
 
@@ -161,28 +161,17 @@ def test_a_row_is_found_alike_alone_and_beside_one_that_is_no_number(rows: list[
 @torch.no_grad()
 @pytest.mark.compiled
 @pytest.mark.needs_compiler
-def test_compiled_passes_and_the_whole_search_as_one_program_find_what_plain_torch_finds() -> None:
+def test_compiled_passes_find_what_plain_torch_finds() -> None:
     problem, x = waved(-0.6, 0.9), WAVED_X.clone()
     start, around = WAVED_U[:, :2], Reference(*(part[:, :2] for part in WAVED_AROUND))
     x[5] = torch.nan
-    plain = adp.BoxDDP(problem, steps=2, iterations=12, compile=False)
-    found = plain.solve(x, start, around)
-    passes = adp.BoxDDP(problem, steps=2, iterations=12).solve(x, start, around)
-
-    def search(
-        carry: tuple[()], _: tuple[()], row: tuple[Tensor, ...]
-    ) -> tuple[tuple[()], tuple[Tensor, ...]]:
-        part = plain.solve(row[0], row[1], Reference(*row[2:]))
-        return carry, (part.state, part.control, part.feedback, part.cost)
-
-    program = lanes.Program(search, name="a search")
-    given = x, start.contiguous(), *(part.contiguous() for part in around)
-    assert program.compiles((), (), given, steps=1)
-    whole = [part[:, 0] for part in program((), (), given, steps=1)[1]]
+    found, passes = (
+        adp.BoxDDP(problem, steps=2, iterations=12, **settings).solve(x, start, around)
+        for settings in ({"compile": False}, {})
+    )
     fine = torch.arange(8) != 5
-    for k, wanted in enumerate((found.state, found.control, found.feedback, found.cost)):
-        for other in (whole[k], (passes.state, passes.control, passes.feedback, passes.cost)[k]):
-            torch.testing.assert_close(other[fine], wanted[fine], rtol=0, atol=1e-8)
+    for name in ("state", "control", "feedback", "cost"):
+        torch.testing.assert_close(getattr(passes, name)[fine], getattr(found, name)[fine], rtol=0, atol=1e-8)
     assert torch.equal(passes.converged, found.converged)
     assert bool(found.converged.any())
 

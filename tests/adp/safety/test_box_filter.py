@@ -19,9 +19,6 @@ BOX = systems.Barrier(CHAIN, low=[-7.0, -5.0], high=[5.0, 7.0])
 COST = adp.QuadraticCost(10.0, 0.1, dim=2, inputs=1)
 OF_S = adp.LQR(BOX, COST)
 DT = 1e-3
-# Who brakes before the one wall comes to the other one: half of the program of four walls.
-CORNER = systems.Barrier(CHAIN, low=[None, -5.0], high=[5.0, None])
-OF_CORNER = adp.LQR(CORNER, COST)
 WALL = systems.Barrier(CHAIN, low=None, high=[5.0, None])
 
 
@@ -109,15 +106,6 @@ def test_a_way_that_is_a_line_has_a_control() -> None:
     for dtype in (torch.float64, torch.float32):
         u = guard(BOX.transform(tensor([[4.999999, 3.4938383727974553]])).to(dtype))
         assert float(u) == pytest.approx(-2.103e7, rel=1e-3)  # v^2/d, by v = 3.49 and d = 5e-7
-
-
-@pytest.mark.compiled
-def test_compiled_it_keeps_the_same_starts() -> None:
-    s0 = CORNER.transform(beside_the_walls(16))[beside_the_walls(16)[:, 0] > 0]
-    guard = adp.BoxFilter(OF_CORNER, CORNER, dt=DT)
-    run = adp.simulate(adp.Feedback(guard), CORNER, COST, s0, steps=1, substeps=16, compile=True)
-    assert torch.equal(run.diverged, guard.share(s0) >= 1)
-    assert 1 < int(run.diverged.sum()) < len(s0) - 1
 
 
 def test_where_no_wall_is_near_not_a_bit_changes_and_rows_are_alone() -> None:
