@@ -16,8 +16,8 @@ import torch
 
 from ..trace.graph import FLAG, NARROW, REAL, ROW, STEP, WHOLE, WIDE, Graph, Sizes
 from ..trace.tracer import LARGE, NotLoweredError
+from .array_memory import in_rooms
 from .c import Names, ScalarWriter, random_numbers
-from .rooms import in_rooms
 from .schedule import Schedule, made_again
 from .tables import TableWriter, Text
 

@@ -1,4 +1,10 @@
-"""Statements of eliminations in place: a factor of a matrix, and right sides under a triangle."""
+"""Statements of eliminations in place: a factor of a matrix, and right sides under a triangle.
+
+As single numbers an elimination is a text that grows with the cube of its size; as passes over whole
+matrices (`trace.factorisations`) it writes every entry to memory once a pass. Here loops go through the
+entries, in the order of those passes, which keeps every bit, and what becomes of an entry stays in a
+register until it is done.
+"""
 
 from __future__ import annotations
 

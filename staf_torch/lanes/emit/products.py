@@ -1,4 +1,9 @@
-"""Statements of sums of products: some of them in registers at once, so that a number is read for several."""
+"""Statements of sums of products: some of them in registers at once, so that a number is read for several.
+
+A sum by itself reads two numbers for a multiplication. Several rows of sums, or of two matrices a square of
+rows and columns, are computed side by side; each still adds its products in its own order, so that the bits
+are those of one.
+"""
 
 from __future__ import annotations
 

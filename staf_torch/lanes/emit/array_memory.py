@@ -1,4 +1,9 @@
-"""Memory of a thread: arrays that live one after the other lie in the same."""
+"""Memory of a thread: arrays that live one after the other lie in the same.
+
+As in register allocation by linear scan (Poletto and Sarkar, 1999), an array lives from its declaration to
+the last line that names it, and takes a place that is free by then. Declared one by one, all of them would
+take memory at once.
+"""
 
 from __future__ import annotations
 
