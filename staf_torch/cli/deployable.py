@@ -57,15 +57,12 @@ class CarriesPlanError(ValueError):
 
 
 def deployable(run: Path, row: int = 0, *, trust: bool = False, function: bool = False) -> Deployable:
-    """Return the deployable part of one trajectory: its controller, or its approximation at the last time.
+    """Return the deployable part of one trajectory (``row``): its controller, or its approximation at the
+    last time.
 
-    The objects are built anew from the run's settings, and must reproduce what the run recorded.
-
-    Args:
-        run: the directory.
-        row: the trajectory.
-        trust: whether code of your own that the settings name may be imported.
-        function: of a controller that carries a plan where a bound is met: take its policy, which does not.
+    The objects are built anew from the run's settings, and must reproduce what the run recorded. ``trust``
+    says whether code of your own that the settings name may be imported; ``function``, of a controller that
+    carries a plan where a bound is met, takes its policy, which does not.
 
     Raises:
         CarriesPlanError: if the controller carries a plan, and ``function`` is not set.
@@ -105,11 +102,7 @@ class Learner:
 def learning(run: Path, row: int = 0, *, trust: bool = False) -> Learner:
     """The controller of one trajectory as it was at time 0, that learns or plans as it did in the run.
 
-    Args:
-        run, row, trust: as in `deployable`.
-
-    Raises:
-        ValueError: as `deployable`, or if the run's controller is a function of x.
+    Arguments and errors as of `deployable`; ValueError also if the run's controller is a function of x.
     """
     with _opened(run, row, {"adp": _learner}, trust) as (cfg, history, precise, written_by):
         return dataclasses.replace(_learner(cfg, history, precise, row), written_by=written_by)

@@ -59,12 +59,10 @@ def export(
         to: onnx, pt2 (a `torch.export` program), aoti (an AOTInductor package) or c (a header).
         dtype: float64 or float32.
         output: of the file; RUN/export/<kind> and an ending by default.
-        row: the trajectory.
+        row, trust, function: as in `deployable`.
         batch: fixed number of rows of a call; any by default.
         calls: that the latency is the worst of.
-        trust: as in `deployable`.
         name: of the C function or the graph; that of the run's folder by default.
-        function: as in `deployable`.
 
     Raises:
         ValueError: if an argument breaks its rule, an extra or a compiler is missing, the run cannot be
@@ -108,13 +106,8 @@ def export_learning(
     """Write a C header of a controller that goes on learning, or carries a plan, and its sheet.
 
     The header has the weights, or the plan, of time 0 and must follow the first steps of the run: the same
-    states and random numbers give the same controls.
-
-    Args:
-        run, dtype, output, row, calls, trust, name: as in `export`; the default name ends with ``_learner``.
-
-    Raises:
-        ValueError: as `export`.
+    states and random numbers give the same controls. Arguments and errors as of `export`; the default name
+    ends with ``_learner``.
     """
     choice("staf-export", "dtype", dtype, tuple(DTYPES))
     c_header.need_c_compiler()

@@ -139,13 +139,9 @@ def _options(folder: Path, group: str) -> Node:
 def _merged(
     nodes: Sequence[Node], prefix: str, said: Mapping[str, str], target: str | None = None
 ) -> dict[str, Node]:
-    """Return name -> schema of all keys of mappings of one kind.
+    """Return name -> schema of all keys of mappings of one kind, arguments of ``target``.
 
-    Args:
-        nodes: the mappings.
-        prefix: of their keys, with a dot at its end.
-        said: dotted key -> its comment.
-        target: what they are the arguments of.
+    Keys begin with ``prefix``, which ends with a dot; ``said`` has the comment of each dotted key.
     """
     hints = {} if target is None else _hints(target)
     found: dict[str, Node] = {}

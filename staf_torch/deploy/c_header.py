@@ -226,15 +226,10 @@ def _said(note: str, source: Source, takes: str) -> str:
 
 
 def runner_c(path: Path, sizes: Sequence[int | None], dtype: torch.dtype) -> Run:
-    """The header, compiled with -O2 and called a row at a time.
+    """The header, compiled with -O2 and called a row at a time, with as many entries of every output, None
+    for a scalar.
 
-    Args:
-        path: of the header.
-        sizes: entries of every output, None for a scalar.
-        dtype: as in `export_c`.
-
-    Raises:
-        ValueError: if there is no C compiler.
+    Raises ValueError if there is no C compiler.
     """
     kind = _c_type(dtype)
     names = ", ".join(f"o{k}" for k in range(len(sizes)))
@@ -302,17 +297,8 @@ def runner_learning_c(
 ) -> Callable[[Tensor, Tensor], Tensor]:
     """The header of a controller that learns, compiled with -O2: it starts anew and follows given states.
 
-    Args:
-        path: of the header.
-        draws: of the controller.
-        inputs: of the plant, m.
-        dtype: as in `export_learning_c`.
-
-    Returns:
-        A function of states (K, n) and random numbers (K, draws, n) that returns the controls (K, m).
-
-    Raises:
-        ValueError: if there is no C compiler.
+    The function that is returned takes states (K, n) and random numbers (K, draws, n) to the controls (K, m);
+    m are the ``inputs`` of the plant. Raises ValueError if there is no C compiler.
     """
     kind, name = _c_type(dtype), _name(path)
     step = f"{name}(&s, x + k * n, {f'z + k * n * {draws}, ' if draws else ''}u + k * {inputs})"

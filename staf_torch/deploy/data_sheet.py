@@ -145,11 +145,7 @@ def worst_difference(got: tuple[Tensor, ...], wanted: tuple[Tensor, ...]) -> lis
 
 
 def markdown(sheet: Mapping[str, Any]) -> str:
-    """The sheet of `staf-export`, for reading.
-
-    Args:
-        sheet: as in the JSON beside it.
-    """
+    """The sheet of `staf-export` as text, from the JSON beside it."""
     work, late = sheet["work"], sheet["latency"]
     ports = [
         f"| {way} | `{port['name']}` | {_shape(port['size'])} "

@@ -278,14 +278,10 @@ class OnnxFile(NamedTuple):
 def in_loops(
     module: nn.Module, example: Tensor, names: Sequence[str], batch: int | None, name: str
 ) -> OnnxFile | None:
-    """Return a module with loops as an ONNX model; None where it has none, or rows that are not alone.
+    """Return a module (B, n) -> a tensor, or a tuple of tensors (B,) and (B, m), with loops as an ONNX model;
+    None where it has none, or rows that are not alone.
 
-    Args:
-        module: (B, n) -> a tensor or a tuple of tensors (B,) and (B, m).
-        example: an input, (B, n).
-        names: of the input and the outputs.
-        batch: rows; None for any.
-        name: of the graph.
+    ``names`` are of the input and the outputs, ``name`` that of the graph; ``batch`` are rows, None for any.
     """
     writer = OnnxWriter(np.dtype(np.float32 if example.dtype == torch.float32 else np.float64), names[0])
     with torch.no_grad():
@@ -297,12 +293,8 @@ def in_loops(
 
 
 def renamed(model: Any, names: Mapping[str, str]) -> Any:
-    """Return a model with other names of values; a value within that has one of them already gets another.
-
-    Args:
-        model: as torch writes it.
-        names: old and new.
-    """
+    """Return a model, as torch writes it, with other names of values, old to new; a value within that has one
+    of them already gets another."""
     table = {new: f"_own_{new}" for new in names.values()} | dict(names)
 
     def visit(graph: Any) -> None:

@@ -18,16 +18,11 @@ _LONGEST = 48  # characters of a name that nobody gave
 def function_name(
     call: str, name: str | None, thing: nn.Module | Controller | None, beside: Sequence[str] = ()
 ) -> str:
-    """Return the name of what is exported, by default that of its class in small letters.
+    """Return the name of what is exported, by default that of its class in small letters, "policy" of
+    nothing.
 
-    Args:
-        call: the exporter, for messages.
-        name: as it was given.
-        thing: a policy or a controller; None for "policy".
-        beside: names that its function has inside.
-
-    Raises:
-        ValueError: if C or C++ has taken the name.
+    ``beside`` are names that its function has inside; ``call`` is the exporter, for messages. Raises
+    ValueError if C or C++ has taken the name.
     """
     if name is None:
         found = made_name(_of(thing), "policy")
@@ -37,12 +32,8 @@ def function_name(
 
 
 def made_name(text: str, kind: str) -> str:
-    """Return a name that C and C++ take, of any text: other characters become _, what is taken gets an end.
-
-    Args:
-        text: as a class or a folder is called.
-        kind: what stands before a number, and behind a name that is taken.
-    """
+    """Return a name that C and C++ take, of any text: other characters become _; ``kind`` stands before a
+    number, and behind a name that is taken."""
     found = re.sub(r"_{2,}", "_", re.sub(r"[^A-Za-z0-9]", "_", text)).strip("_")[:_LONGEST].rstrip("_")
     if not found or not found[0].isalpha():
         found = f"{kind}_{found}".rstrip("_")

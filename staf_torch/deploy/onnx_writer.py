@@ -33,12 +33,7 @@ _OF_LOOPS = ("loop", "result", "results", "collect", "carry", "carrys")
 class OnnxWriter:
     """An ONNX graph that grows by programs of one row, and by what policies with tables do between them.
 
-    Args:
-        real: dtype of the numbers.
-        first: the input, which has all rows.
-
-    Attributes:
-        source: what a call costs for a row.
+    ``first`` names the input, which has all rows; `source` is what a call costs for a row.
     """
 
     def __init__(self, real: Any, first: str) -> None:
@@ -81,13 +76,8 @@ class OnnxWriter:
     # Policies.
 
     def policy(self, module: nn.Module, x: Tensor, state: str) -> list[tuple[str, int | None]] | None:
-        """Write a policy that has loops; None, and nothing written, for any other.
-
-        Args:
-            module: as in `in_loops`.
-            x: an input, (1, n).
-            state: the name of the input.
-        """
+        """Write a policy that has loops, as `in_loops` takes it, with the input x (1, n) of the name
+        ``state``; None, and nothing written, for any other."""
         if isinstance(module, RememberedPolicy):
             return [(self._remembered(module, x, state), module.problem.inputs)]
         if searches(module):

@@ -29,12 +29,7 @@ class Source(NamedTuple):
     functions: int  # calls of exp and the like
 
     def work(self, entries: int, dtype: torch.dtype) -> Work:
-        """Return the cost in the words of `staf-export`.
-
-        Args:
-            entries: of all inputs and outputs.
-            dtype: of the arithmetic.
-        """
+        """Return the cost in the words of `staf-export`, with as many entries of all inputs and outputs."""
         size = dtype.itemsize
         return Work(self.constants, self.flops, self.functions, self.constants * size, entries * size)
 

@@ -170,12 +170,7 @@ def solve(problem: AdpProblem, progress: Progress = SHOWN) -> LoopResult:
 def simulate_together(
     problems: Sequence[AdpProblem], progress: Callable[[int], None] | None = None
 ) -> list[LoopResult]:
-    """Run problems; those that differ in numbers alone are one loop with a row of numbers each.
-
-    Args:
-        problems: at least one; of the same number of steps.
-        progress: as in `simulate`.
-    """
+    """Run problems, at least one; those that differ in numbers alone are one loop with numbers of each row."""
 
     def run(
         jobs: Sequence[int], objects: Any, rows: RowsOfJobs, advance: Callable[[int], None] | None

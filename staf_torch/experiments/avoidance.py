@@ -111,12 +111,7 @@ _COLUMNS = {
 
 
 class AmongDiscs(ControlAffineSystem):
-    """A vehicle and discs in the plane, (x, c_1, c_1', ..., c_K, c_K') with c_k'' = 0.
-
-    Args:
-        vehicle: with states x.
-        discs: K.
-    """
+    """A vehicle with states x and K discs in the plane, (x, c_1, c_1', ..., c_K, c_K') with c_k'' = 0."""
 
     inputs = 2
 

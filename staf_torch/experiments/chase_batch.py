@@ -52,11 +52,12 @@ def simulate(
     advance: Callable[[int], None] | None = None,
     errors: StateErrorPass | None = None,
 ) -> list[Outcome]:
-    """Run problems in pieces of time; those that differ in numbers run as one batch.
+    """Run problems in pieces of time, and return their outcomes in order; those that differ in numbers run as
+    one batch.
 
     What differs between problems, a radius, a width, a gain, a mass, is then a column with a number a row.
-    Objects that differ in more, or with which a row's own numbers are not served, run one after the other.
-    No problem sees another.
+    Objects that differ in more, or with which a row's own numbers are not served, run one after the other. No
+    problem sees another.
 
     Args:
         problems: with the same number of steps and centers, the same iterations, predictor and certificate.
@@ -64,9 +65,6 @@ def simulate(
         drawn: whether the outcome of each has what its figure needs.
         advance: is told how many more times are done, those of every problem.
         errors: of their metrics, where all have the same basis, target and initial states.
-
-    Returns:
-        In the order of the problems.
     """
     objects = [_Objects.of(problem) for problem in problems]
 
@@ -107,16 +105,9 @@ def _run(
     *,
     alone: bool,
 ) -> list[Outcome]:
-    """Run problems of the same dt as one batch.
+    """Run problems of the same dt as one batch, with the objects and rows of all of them.
 
     Unless one problem is ``alone``, each member keeps the warnings about its own rows.
-
-    Args:
-        members: the problems.
-        parts: theirs, with numbers of rows where they differ.
-        rows: of all members.
-        advance, errors: of `simulate`.
-        alone: whether there is no other problem.
     """
     first, basis = members[0].problem, parts.basis
     times, starts = first.steps + 1, torch.cat([member.problem.initial_states for member in members])
@@ -189,14 +180,9 @@ def _chased(first: ChaseProblem, parts: _Objects, starts: Tensor, chunk: int) ->
 def _pieces(
     starts: Tensor, times: int, basis: StaFBasis, *, jobs: int, kept: bool
 ) -> tuple[Sequence[Tensor], int]:
-    """Return the initial states (B, n) in blocks that go through time together, and the times of a piece.
+    """Return initial states (B, n) in blocks that go through time together, and the times of a piece.
 
-    Args:
-        starts: of all rows.
-        times: of the chase.
-        basis: at every state.
-        jobs: problems whose rows they are.
-        kept: whether a history is.
+    They are the rows of so many ``jobs``; ``kept`` says whether a history is.
     """
     share, size = 1 if starts.is_cpu else _ON_DEVICE, starts.element_size()
     together = share * (_ROWS_OF_JOBS if starts.is_cpu and jobs > 1 else _ROWS)

@@ -71,14 +71,11 @@ class LawCase(NamedTuple):
 
 
 def cases(work: int, count: int) -> list[LawCase]:
-    """Every law at up to ``work`` products with K a time step, then the predictors.
+    """Every law at up to ``work`` products with K a time step, at least 2, with ``count`` centers, then the
+    predictors.
 
-    Laws that are done sooner are not given more, and what a predictor costs is taken from the iterations;
-    one is left where it costs as much as all of them.
-
-    Args:
-        work: products a time step, at least 2.
-        count: M.
+    Laws that are done sooner are not given more, and what a predictor costs is taken from the iterations; one
+    is left where it costs as much as all of them.
     """
     many = work - 1
     chosen: list[tuple[UpdateLaw, int, Predictor | None]] = [

@@ -50,13 +50,8 @@ class Learning(NamedTuple):
     offsets: Tensor  # z (P, n) of the ball
 
     def squares(self, width: Tensor, radius: Tensor, states: Tensor) -> Tensor:
-        """The mean of (V(x + z) - V^(x + z))^2 over times and points of the ball, a trajectory each: (B,).
-
-        Args:
-            width: of the kernel; a number, or `rows` of one for each trajectory.
-            radius: of the centers; the same.
-            states: x, (B, T, n).
-        """
+        """The mean of (V(x + z) - V^(x + z))^2 over times and points of the ball, for states x (B, T, n):
+        (B,). Width and radius are numbers, or `rows` of one for each trajectory."""
         problem, kernel = self.problem, self.kernel(width)
         centers = StateFollowingCenters(problem.basis.centers.directions, ConstantRadius(radius))
         found = chase(
@@ -147,11 +142,8 @@ def problem_of(cfg: DictConfig) -> Learning:
 
 
 def learn(problem: Learning, steps: int, rate: float, progress: Progress = SHOWN) -> tuple[Tensor, Tensor]:
-    """Follow the gradient of the logarithm of the error by Adam.
-
-    Returns:
-        Logarithms of width and radius (S + 1, 2), and the errors there (S + 1,); the start is first.
-    """
+    """Follow the gradient of the logarithm of the error by Adam; return the logarithms of width and radius (S
+    + 1, 2) and the errors there (S + 1,), the start first."""
     at = problem.start.clone().requires_grad_()
     optimiser = torch.optim.Adam([at], lr=rate)
     points, errors = [], []

@@ -26,12 +26,8 @@ Advance = Callable[[int], None]
 class RowsOfJobs:
     """The rows of a call, each with the numbers of its job.
 
-    Args:
-        kinds: of each job, the row of the numbers of its objects.
-        counts: rows of each job.
-
-    Attributes:
-        differ: whether jobs have numbers of their own.
+    ``kinds`` has the row of numbers of each job, ``counts`` its rows; `differ` says whether jobs have numbers
+    of their own.
     """
 
     def __init__(self, kinds: Sequence[int], counts: Sequence[int]) -> None:
@@ -45,11 +41,7 @@ class RowsOfJobs:
 
 
 class ToldOnce:
-    """Progress of calls, of which one that fails is made again in parts: nothing is told twice.
-
-    Args:
-        advance: is told how much more is done; None where nobody listens.
-    """
+    """Progress of calls, of which one that fails is made again in parts: nothing is told twice."""
 
     def __init__(self, advance: Advance | None) -> None:
         self._advance, self._ahead = advance, 0  # told by calls that failed
@@ -96,8 +88,7 @@ def in_calls(
     all objects serve them, its jobs run one after the other: those of the same objects together.
 
     Args:
-        call: gets the jobs by number, the objects that have the numbers of all, their rows, and `advance`;
-            returns the results of the jobs.
+        call: gets the jobs by number, the objects that have the numbers of all, their rows, and `advance`.
         objects: of each job; the same object for jobs that share it.
         counts: rows of each job.
         alike: what jobs must have in common to share a call.

@@ -56,18 +56,10 @@ class Experiment(Protocol):
     """A study: a function, or an object that is called like one."""
 
     def __call__(self, cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
-        """Run what the settings describe and fill the run directory; `metrics.json` comes last.
+        """Run what the settings (all but Hydra's) describe, fill the run directory, which exists, and return
+        what `metrics.json` holds; that file comes last.
 
-        Args:
-            cfg: all settings but Hydra's.
-            directory: the run directory; it exists.
-            progress: shows how far long loops are.
-
-        Returns:
-            What `metrics.json` holds.
-
-        Raises:
-            ValueError: if a setting breaks its rule.
+        Raises ValueError if a setting breaks its rule.
         """
         ...
 

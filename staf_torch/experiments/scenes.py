@@ -29,12 +29,7 @@ _GRID, _ACROSS = 81, 41
 def animation_kind(cfg: DictConfig | PlainSettings, dim: int | None = None) -> str | None:
     """Return what the setting `animation` asks for, gif or html; None for no animation.
 
-    Args:
-        cfg: the settings.
-        dim: n, where it is known: at least 2.
-
-    Raises:
-        ValueError: for anything else, or a state that is a number.
+    Raises ValueError for anything else, or where the state is known to have fewer than two coordinates.
     """
     wanted = cfg.get("animation", False)
     if wanted is False:

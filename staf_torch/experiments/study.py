@@ -44,12 +44,8 @@ class Method(NamedTuple):
 class Study:
     """Collect what methods have reached, in the order of the table, and write it.
 
-    Args:
-        name: of the table.
-        columns: of the table: name of a number or label -> heading.
-        logged: numbers that the log shows of a method; empty: no line.
-        log: where the study logs.
-        digits: of the table.
+    ``columns`` has the heading of each number or label of the table, ``logged`` the numbers that the log
+    shows of a method, none for no line.
     """
 
     def __init__(
@@ -72,13 +68,10 @@ class Study:
         more: Mapping[str, float | str | None] | None = None,
         **labels: str,
     ) -> None:
-        """Add a method.
+        """Add a method with its numbers, None where there is none, and what the table calls it, by column.
 
-        Args:
-            prefix: of its names in `metrics.json`; empty for the method that the study is about.
-            measured: name -> number, or None where there is none.
-            more: what the table has of it and `metrics.json` has not, as times.
-            labels: what the row is called, by column.
+        Its names in `metrics.json` begin with ``prefix``; ``more`` is what the table alone has of it, as
+        times.
         """
         self.rows.append(labels | dict(measured) | dict(more or {}))
         self.metrics |= {prefix + name: finite(value) for name, value in measured.items()}
@@ -92,13 +85,8 @@ class Study:
         out.table(self._name, dataclasses.replace(table, style=self._style))
 
     def write(self, out: RunDirectory, drawing: Drawing | None, figure: str | None = None) -> Metrics:
-        """Write the table, the figure where one is wanted, and `metrics.json` at last.
-
-        Args:
-            out: the run directory.
-            drawing: draws the figure; None: it is not wanted.
-            figure: its name, that of the table by default.
-        """
+        """Write the table, the figure (of the table's name by default) where one is wanted, and
+        `metrics.json` at last."""
         self.write_table(out)
         if drawing is not None:
             out.figure(figure or self._name, images(drawing()))
@@ -147,13 +135,9 @@ def write_history(out: RunDirectory, time: Tensor, arrays: Mapping[str, Tensor])
 
 
 def log_diverged(log: logging.Logger, starts: Tensor | np.ndarray, at: Tensor, also: str = "") -> None:
-    """Warn of each diverged trajectory, up to twenty of them by number.
+    """Warn of each diverged trajectory, up to twenty of them by number, and of what ``also`` happens to it.
 
-    Args:
-        log: where the experiment logs.
-        starts: initial states, (B, n).
-        at: s, when a row diverged; inf where it did not, (B,).
-        also: what else happens to it.
+    Starts are (B, n), ``at`` the times of divergence in s, inf where a row did not, (B,).
     """
     rows = at.isfinite().nonzero().flatten().tolist()
     for row in rows[:_NAMED]:

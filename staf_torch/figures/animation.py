@@ -57,12 +57,8 @@ class Scene(NamedTuple):
 
 
 def animate(scene: Scene, kind: str) -> dict[str, bytes]:
-    """Return the animation by its ending.
-
-    Args:
-        scene: what moves.
-        kind: ``gif``, or ``html``: one page that plays in a browser, with the frames inside and no server.
-    """
+    """Return the animation of a scene by its ending: ``gif``, or ``html``, one page that plays in a browser,
+    with the frames inside and no server."""
     import matplotlib
     from matplotlib.figure import Figure
 

@@ -137,11 +137,8 @@ def _cost(axes: Axes, history: AdpHistory) -> None:
 
 
 def draw_comparison(ratios: Mapping[str, np.ndarray]) -> Figure:
-    """The share of initial states regulated at most at a multiple of the optimal cost, one curve a method.
-
-    Args:
-        ratios: method to cost / optimal cost, (B,); inf for trajectories that were not regulated.
-    """
+    """The share of initial states regulated at most at a multiple of the optimal cost, one curve a method, by
+    cost / optimal cost (B,), inf for trajectories that were not regulated."""
     excess = {name: np.sort(np.maximum(values - 1, _LEAST_EXCESS)) for name, values in ratios.items()}
     known = np.concatenate([values[np.isfinite(values)] for values in excess.values()])
     with panels(1, 2, high=2.8, spare=list(ratios)) as (figure, (axes,)):
@@ -376,10 +373,8 @@ _LEAST = 1e-5  # excess cost that is drawn at the edge
 def draw_rivals(rows: Sequence[Mapping[str, Any]]) -> Figure:
     """Draw a panel a plant: median excess cost over the best known against microseconds a control.
 
-    A method that regulated some of the states alone is hollow; one that regulated none is not drawn.
-
-    Args:
-        rows: ``plant``, ``method``, ``ratio_median``, ``regulated``, ``us_median``; None where not measured.
+    A method that regulated some of the states alone is hollow; one that regulated none is not drawn. Rows
+    have ``plant``, ``method``, ``ratio_median``, ``regulated`` and ``us_median``, None where not measured.
     """
     plants = list(dict.fromkeys(row["plant"] for row in rows))
     methods = list(dict.fromkeys(row["method"] for row in rows if row["ratio_median"] is not None))

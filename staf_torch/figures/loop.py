@@ -33,13 +33,10 @@ def with_unit(name: str, unit: str) -> str:
 def by_unit(
     whole: str, letter: str, units: Sequence[str], sizes: Sequence[float] | None = None
 ) -> list[Group]:
-    """Group the entries of a vector by their units: an axis has one, of entries of one size.
+    """Group the entries of a vector by their units, "" for none: an axis has one, of entries of one size.
 
-    Args:
-        whole: name of an axis that shows all entries, as ``state $x$``.
-        letter: of an entry.
-        units: of every entry, "" for none.
-        sizes: of every entry; those with a unit that differ tenfold have axes of their own.
+    ``whole`` names an axis that shows all entries, as ``state $x$``, ``letter`` an entry; entries with a unit
+    whose ``sizes`` differ tenfold have axes of their own.
     """
     found: dict[tuple[str, int], list[int]] = {}
     for i, unit in enumerate(units):

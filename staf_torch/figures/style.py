@@ -91,14 +91,12 @@ class FigurePaper(NamedTuple):
 
     @classmethod
     def chosen(cls, name: str, prefix: str, width: object = None, font: object = None) -> FigurePaper:
-        """Return the paper of a width in inches and a font: `9`, `serif`, or `9 Times New Roman`.
+        """Return the paper of a width in inches (2 to 40, 7.2 by default) and a font: `9`, `serif`, or `9
+        Times New Roman`.
 
-        Args:
-            name: of who was given them, and ``prefix`` of the arguments, for messages.
-            prefix: likewise.
-            width: inches, from 2 to 40; None for 7.2.
-            font: size in pt, from 3 to 40, family, or both; None for 8 pt, sans-serif. A family is `serif`,
-                `sans-serif`, `monospace` or a font that matplotlib finds.
+        A font is a size in pt, from 3 to 40, a family (`serif`, `sans-serif`, `monospace` or one that
+        matplotlib finds), or both; 8 pt and sans-serif by default. ``name`` and ``prefix`` are of who was
+        given them and of the arguments, for messages.
 
         Raises:
             ValueError: if one breaks its rule.
@@ -223,12 +221,8 @@ def panels(
 ) -> Iterator[tuple[Figure, list[Axes]]]:
     """Yield a page and so many axes, ``most`` in a row where the paper is wide enough.
 
-    Args:
-        count: of axes.
-        most: in a row.
-        high: inches of a panel, with type of 8 pt; None: by the number of columns.
-        spare: lines of a legend that gets a place of its own, the last; none: it finds one in the axes.
-        shared: `sharex`, `sharey`.
+    A panel is so many inches ``high`` with type of 8 pt, by default by the number of columns. ``spare`` are
+    the lines of a legend that gets a place of its own, the last; ``shared`` are `sharex` and `sharey`.
     """
     paper = _PAPER.get()
     columns = paper.across(min(most, count + bool(spare)))
@@ -374,12 +368,9 @@ def letter(grid: Iterable[Axes], *titles: str) -> None:
 def legend(*grid: Axes, handles: Sequence[Artist] = (), title: str | None = None) -> None:
     """Put one legend of the labelled lines of these panels into the first that has a free place for it.
 
-    Where none has, the vertical axis of one becomes so long that the legend is above the data.
-
-    Args:
-        grid: the panels; a label that several have stands there once. A spare place comes first.
-        handles: of lines, in place of those.
-        title: of the legend.
+    Where none has, the vertical axis of one becomes so long that the legend is above the data. A label that
+    several panels have stands there once; a spare place comes first. ``handles`` take the place of those
+    lines.
     """
     _WANTED.get().append(Wanted(grid, tuple(handles), title))
 

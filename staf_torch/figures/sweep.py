@@ -227,12 +227,9 @@ def _point(x: float, errors: Sequence[float]) -> Point:
 
 
 def draw_error_against_radius(shown_panels: Sequence[Panel], rounding: float | None) -> Figure:
-    """Both axes logarithmic; a line a count with its 95 % band over the seeds, dotted with ideal weights.
-
-    Args:
-        shown_panels: one a kernel.
-        rounding: the error that rounding of V alone explains; a line, where it is not far below the data.
-    """
+    """Both axes logarithmic, a panel a kernel; a line a count with its 95 % band over the seeds, dotted with
+    ideal weights, and one for the error that ``rounding`` of V alone explains, where it is not far below the
+    data."""
     with _errors(shown_panels) as (figure, grid):
         for axes, shown in zip(grid, shown_panels, strict=True):
             ticks(axes, "x", sorted({point.x for curve in shown.curves for point in curve.points}))
@@ -245,12 +242,8 @@ def draw_error_against_radius(shown_panels: Sequence[Panel], rounding: float | N
 
 
 def draw_cost_against_accuracy(shown_panels: Sequence[Panel], work: str = "products with $K$") -> Figure:
-    """Both axes logarithmic; a line a law and predictor, or a radius, with its 95 % band over the seeds.
-
-    Args:
-        shown_panels: of `cost_against_accuracy`.
-        work: what the work is counted in.
-    """
+    """Both axes logarithmic; a line a law and predictor, or a radius, with its 95 % band over the seeds;
+    ``work`` is what the work is counted in."""
     with _errors(shown_panels) as (figure, grid):
         for axes in grid:
             axes.set_xlabel(f"{work} a simulated second")

@@ -59,11 +59,8 @@ class ErrorPanel(NamedTuple):
 
 
 def draw_exponential_bound(found: Mapping[tuple[float, float], Mapping[str, float | None]]) -> Figure:
-    """Number of kernels against epsilon, a panel a radius: both bounds and what is needed.
-
-    Args:
-        found: by radius and epsilon, the counts by their names.
-    """
+    """Number of kernels against epsilon, a panel a radius: both bounds and what is needed, by radius and
+    epsilon."""
     radii = sorted({radius for radius, _ in found})
     with panels(len(radii), 3, sharex=True, sharey=True) as (figure, grid):
         for axes, radius in zip(grid, radii, strict=True):

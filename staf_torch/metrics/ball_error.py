@@ -37,20 +37,11 @@ class StateErrors(NamedTuple):
 class StateErrorPass:
     """Finds `StateErrors` in one pass over states; consecutive pieces share what is set up once.
 
-    Suprema are over fixed points of the ball. The floor is the best that kernel, radius and layout allow,
-    without the rounding of large weights. Plain torch is the definition; once so many states have been asked
-    for that it pays, a program of `lanes` keeps a state in every lane and V at a point serves all.
-
-    Args:
-        basis: of V^.
-        target: V.
-        points: of the ball, at least 2.
-        compile: whether to compile: ``auto`` for where it pays.
-        expected: states that will be asked for, where that is known: they then pay from the first on, or
-            from the second call where the first has to be counted.
-
-    Attributes:
-        compiled: whether the last call used the compiled program.
+    Suprema are over fixed points of the ball, at least 2. The floor is the best that kernel, radius and
+    layout allow, without the rounding of large weights. Plain torch is the definition; once so many states
+    have been asked for that it pays (``expected`` says how many will be: they then pay from the first on, or
+    from the second call where the first has to be counted), a program of `lanes` keeps a state in every lane
+    and V at a point serves all. `compiled` says whether the last call used it.
     """
 
     def __init__(

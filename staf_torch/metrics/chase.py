@@ -41,34 +41,13 @@ class Chased(NamedTuple):
 class ChaseMetrics:
     """The metrics of a gradient chase, gathered piece by piece so that memory does not grow with time.
 
-    Each is the worst over the times t >= settle_time and over the trajectories that did not diverge;
-    None where there is no such time or trajectory.
+    Each is the worst over the times t >= settle_time (s, with the step dt) and over the trajectories that did
+    not diverge; None where there is no such time or trajectory. `results.run.MEANINGS` says what each is;
+    `certificate_violations` is there only where certificates were made.
 
-    Attributes of the dictionary that `summary` returns:
-        ultimate_error, ultimate_error_before, floor_error: max |V - V^| at the state after correction,
-            before it, and with the ideal weights.
-        ultimate_excess, ultimate_excess_before: max (a - w)'K(a - w).
-        ball_error: max over the closed ball of radius nu(x) of |V - V^|, after correction.
-        ball_floor_error: that maximum with the ideal weights: what kernel, radius and layout allow at best.
-        rounding_floor: eps max |V(x)|, with eps of the precision; no error below it means anything.
-        gradient_error: max |grad V - grad V^| at the state, centers frozen.
-        condition_number: max kappa(K(c(x))).
-        settling_time: the first time (s) from which the excess never again exceeds `ultimate_excess`.
-        contraction_violations: steps whose excess shrank by less than the law's rate promises.
-        certificate_violations: times that break the bound of their `Certificate`; only where one was made.
-        diverged_fraction: diverged trajectories / all.
-
-    Args:
-        basis: kernel and centers.
-        target: V.
-        law: the update law.
-        inner_steps: its iterations at every time.
-        dt: step, in seconds.
-        settle_time: in seconds.
-        members: where the batch holds several problems: `summaries` then has one dictionary a member, and dt
-            and settle_time are theirs.
-        own: metrics of the user's own, reported beside these under their names.
-        errors: finds the errors on a ball, where several chases along the same states share one.
+    Where the batch holds several ``members``, problems with a dt and settle_time of their own, `summaries`
+    has one dictionary each. ``own`` are metrics of the user's own, reported beside these under their names;
+    ``errors`` finds the errors on a ball, where several chases along the same states share one.
     """
 
     def __init__(

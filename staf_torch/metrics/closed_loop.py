@@ -87,14 +87,10 @@ def regulated(result: LoopResult, final: Tensor | None = None) -> Tensor:
 def comparison_row(result: LoopResult, ratio: Tensor, final: Tensor | None = None) -> dict[str, float | None]:
     """A method over many initial states, as a row of a table.
 
-    Args:
-        result: the closed loops.
-        ratio: cost / V*(x(0)), (B,), inf for rows that diverged, NaN where V* was not found.
-        final: as in `adp_metrics`.
-
-    Returns:
-        ``ratio_median`` over the rows that were regulated, as are ``ratio_mean`` and ``ratio_max``; the
-        fractions ``regulated`` and ``diverged`` of all; ``final_state_norm``, the median |e| at the end.
+    ``ratio`` is cost / V*(x(0)), (B,), inf for rows that diverged, NaN where V* was not found; ``final`` as
+    in `adp_metrics`. ``ratio_median``, ``ratio_mean`` and ``ratio_max`` are over the rows that were
+    regulated, the fractions ``regulated`` and ``diverged`` of all; ``final_state_norm`` is the median |e| at
+    the end.
     """
     good = regulated(result, final)
     kept = ratio[good & ~ratio.isnan()]
@@ -112,18 +108,12 @@ def comparison_row(result: LoopResult, ratio: Tensor, final: Tensor | None = Non
 def tracking_metrics(
     result: LoopResult, parameters: Tensor | None, truth: Tensor, optimal_cost: Tensor | None
 ) -> dict[str, float | None]:
-    """The metrics of a tracking run, over the trajectories that did not diverge.
+    """The metrics of a tracking run in the state (e, xd), over the trajectories that did not diverge.
 
-    Args:
-        result: the closed loop in the state (e, xd).
-        parameters: theta^, (B, T, p, n); None where nothing is identified.
-        truth: theta, (p, n).
-        optimal_cost: V*(x(0)) of the known plant, (B,); NaN where it was not found.
-
-    Returns:
-        ``cost``, the median; ``cost_ratio``, the median of cost / V*(x(0)); ``final_error``, the largest |e|
-        of the last tenth of the time; ``parameter_error``, the largest |theta^ - theta| at the end;
-        ``diverged_fraction``.
+    theta^ is (B, T, p, n), None where nothing is identified, theta (p, n), V*(x(0)) of the known plant (B,),
+    NaN where it was not found. ``cost`` is the median; ``cost_ratio`` the median of cost / V*(x(0));
+    ``final_error`` the largest |e| of the last tenth of the time; ``parameter_error`` the largest |theta^ -
+    theta| at the end.
     """
     kept = ~result.diverged
     tail = max(1, result.state.shape[1] // 10)
@@ -145,15 +135,10 @@ def tracking_metrics(
 
 
 def constraint_metrics(result: LoopResult, margin: Tensor) -> dict[str, float | None]:
-    """The metrics of h >= 0 over the recorded times.
+    """The metrics of the smallest h of the constraints at the recorded times, (B, T).
 
-    Args:
-        result: the closed loop.
-        margin: the smallest h over the constraints at the recorded times, (B, T).
-
-    Returns:
-        ``minimum_margin``: the smallest h over rows and times; ``constraint_violations``: the rows with h < 0
-        or h unknown at a time, and those that diverged, as a row of `systems.Barrier` that leaves its box.
+    ``minimum_margin`` is the smallest h over rows and times; ``constraint_violations`` are the rows with h <
+    0 or h unknown at a time, and those that diverged, as a row of `systems.Barrier` that leaves its box.
     """
     known = torch.where(margin.isnan(), torch.inf, margin)
     left = (known < 0).any(-1) | margin.isnan().any(-1) | result.diverged

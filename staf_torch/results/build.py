@@ -32,12 +32,8 @@ _ABSENT = "nothing"
 def digest(path: Path, recorded: str | None = None) -> str:
     """Return the checksum of a regular file of any size: its SHA-256, or `archive_digest` of an `.npz`.
 
-    Args:
-        path: of the file.
-        recorded: the checksum that it had: it is compared as that was made, with all contents read.
-
-    Raises:
-        UnreadableError: if there is none.
+    One that it had (``recorded``) is compared as that was made, with all contents read. Raises
+    UnreadableError if there is no such file.
     """
     with open_regular(path) as file:
         marked = path.suffix == ".npz" if recorded is None else recorded.startswith(MARK)
@@ -71,12 +67,8 @@ def source() -> str:
 
 
 def build(settings: Mapping[str, Any], compiler: str) -> dict[str, Any]:
-    """Return what a run is made by, besides its settings, as `run.json` has it.
-
-    Args:
-        settings: all of the run, by dotted keys.
-        compiler: that makes machine code of the chase, in its own words.
-    """
+    """Return what a run is made by, besides its settings (by dotted keys), as `run.json` has it; the compiler
+    in its own words."""
     return {
         "version": __version__,
         "source": source(),
@@ -110,12 +102,10 @@ def modules(settings: Mapping[str, Any]) -> dict[str, str]:
 
 
 def imported(own: Mapping[str, str]) -> dict[str, str]:
-    """Return a hash of every further module of this process that lies where the user's own modules lie.
+    """Return a hash of every further module of this process that lies where the user's own modules lie, as
+    `modules` found them.
 
     Among them are those that the user's code imports by names that it makes, which nobody finds by reading.
-
-    Args:
-        own: what `modules` found.
     """
     places = (_place(name, tuple(sys.path)) for name in own)
     bases = tuple(f"{base}{os.sep}" for _, base in filter(None, places) if not _installed(base))
@@ -146,13 +136,8 @@ def _hash(name: str) -> str | None:
 def differences(
     then: Mapping[str, Any], now: Mapping[str, Any], free: Callable[[str], bool] = lambda key: False
 ) -> Iterator[str]:
-    """Yield one phrase for each setting, or other entry of a record, that is not what it was.
-
-    Args:
-        then: the record of a run: `settings` and `build`, where it has them.
-        now: the same of a run of today.
-        free: whether the setting of that key may differ.
-    """
+    """Yield one phrase for each setting, unless it is ``free`` to differ, or other entry of a record
+    (`settings` and `build`, where it has them) that is not what it was."""
     was, will = _plain(then.get("settings")), _plain(now.get("settings"))
     for key in sorted({*was, *will}) if was else ():
         before, after = was.get(key, _ABSENT), will.get(key, _ABSENT)
@@ -287,13 +272,11 @@ def damaged(directory: Path, record: Mapping[str, Any], *, thorough: bool) -> st
 
 
 def damage(directory: Path, recorded: Mapping[str, Any], *, thorough: bool) -> str | None:
-    """Return what is wrong with the files of a run; None: they are as they were written.
+    """Return what is wrong with the files of a run, name to size and checksum; None: they are as they were
+    written.
 
-    Args:
-        directory: of the run.
-        recorded: name of a file to its size and checksum.
-        thorough: whether to read them; else only their sizes are looked at, and whether they are there only
-            where they hold numbers.
+    Unless ``thorough`` they are not read: their sizes are looked at, and whether they are there only where
+    they hold numbers.
     """
     for name, about in recorded.items():
         if not (isinstance(about, list) and len(about) == 2) or Path(name).is_absolute() or ".." in name:
@@ -338,11 +321,8 @@ def archive_digest(file: BinaryIO, *, thorough: bool) -> str | None:
 
     A zip archive, and so an `.npz`, keeps the CRC-32 of every member, found while it was written. The
     checksum is the SHA-256 of all that is not content: names, sizes, places and those CRCs; no content is
-    read to find it. An archive is as it was written where that agrees and each content has its CRC.
-
-    Args:
-        file: open for reading.
-        thorough: whether the contents are read, too, and None is returned where one has not its CRC.
+    read to find it. If ``thorough`` the contents are read, too, and None is returned where one has not its
+    CRC.
     """
     try:
         with zipfile.ZipFile(file) as archive:

@@ -91,15 +91,10 @@ class RunDirectory:
         os.replace(partial, path)
 
     def table(self, name: str, table: Printable, *, shown: Printable | Sequence[Printable] = ()) -> str:
-        """Write a table as CSV with every digit and as Markdown.
+        """Write a table as CSV with every digit and as Markdown, and return the Markdown.
 
-        Args:
-            name: of both files, without their endings.
-            table: for programs.
-            shown: tables for the Markdown in place of that one.
-
-        Returns:
-            The Markdown.
+        ``name`` is that of both files, without their endings; ``shown`` are tables for the Markdown in place
+        of that one.
         """
         several = shown if isinstance(shown, Sequence) else [shown]
         text = "\n".join(each.markdown() for each in several or [table])
@@ -117,13 +112,9 @@ class RunDirectory:
             write_bytes(folder / f"{name}.{ending}", content)
 
     def metrics(self, metrics: dict[str, float | None]) -> dict[str, float | None]:
-        """Write `metrics.json`, the last of the files: who finds it finds them all.
+        """Write `metrics.json`, the last of the files, and return the metrics: who finds it finds them all.
 
-        Returns:
-            The metrics.
-
-        Raises:
-            ValueError: for a number that is not finite.
+        Raises ValueError for a number that is not finite.
         """
         write_metrics(self._place(METRICS), metrics)
         self._closed = True
@@ -137,11 +128,7 @@ class RunDirectory:
 class History(Mapping[str, np.ndarray]):
     """The arrays of a `history.npz`, each read when it is first asked for.
 
-    Args:
-        path: of the archive.
-
-    Raises:
-        UnreadableError: if there is none that can be read.
+    Raises UnreadableError if there is none that can be read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -189,15 +176,8 @@ class HistoryWriter:
     Memory grows neither with B nor with T. The pieces of a block of rows are held until all its times are
     there, or a budget is full; they go into a hidden archive beside the place of the final one in a few large
     writes, each to where it stays. The archive appears at once and complete, or not at all. A context
-    manager: leaving it by an exception removes the hidden file.
-
-    Args:
-        path: of the archive.
-        batch: B.
-        times: T.
-
-    Raises:
-        OSError: if the directory cannot be written.
+    manager: leaving it by an exception removes the hidden file. Raises OSError if the directory cannot be
+    written.
     """
 
     def __init__(self, path: Path, batch: int, times: int) -> None:
@@ -212,11 +192,9 @@ class HistoryWriter:
         self._complete = self._fill = 0  # rows with all times; times that are held
 
     def add(self, pieces: Mapping[str, np.ndarray], row: int = 0) -> None:
-        """Append the next piece of time of a block of rows, every array (b, C, ...) with the same b and C.
+        """Append the next piece of time of a block of rows, arrays (b, C, ...) by the same names each time.
 
-        Args:
-            pieces: the arrays by name, the same names each time.
-            row: the first row of the block. Blocks follow each other, each with all its times.
+        Blocks follow each other by their first ``row``, each with all its times.
         """
         rows, length = next(iter(pieces.values())).shape[:2]
         assert all(piece.shape[:2] == (rows, length) for piece in pieces.values())
@@ -294,13 +272,7 @@ class HistoryWriter:
 
 
 class _Array:
-    """An array of an archive whose data arrive in any order.
-
-    Args:
-        name: of its file.
-        begin: where it begins in the archive, in bytes.
-        shape, dtype: of the array.
-    """
+    """An array of an archive whose data arrive in any order; it begins at that byte of the archive."""
 
     def __init__(self, name: str, begin: int, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
         head, described = io.BytesIO(), {"descr": dtype.str, "fortran_order": False, "shape": shape}

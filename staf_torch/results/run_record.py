@@ -34,11 +34,10 @@ class RunRecord:
     """Write `run.json` when a run begins and again when it ends.
 
     Args:
-        cfg: all settings but Hydra's.
+        cfg: all settings but Hydra's; ``known`` is what `flat` returns of them, where that is known.
         choices: the option chosen of each group of settings.
         overrides: as typed.
         compiler: that makes machine code of the run, in its own words.
-        known: what `flat` returns of the settings, where that is known.
     """
 
     def __init__(
@@ -115,14 +114,9 @@ class RunRecord:
     def finished(self, directory: Path, *, anyway: bool = False) -> dict[str, float | None] | None:
         """Return the metrics of this very run where it was completed before, else None; of a table, nothing.
 
-        A run whose files are damaged is none that was completed; a warning names the file.
-
-        Args:
-            directory: of the run.
-            anyway: whether a run of other settings, source, modules, torch or compiler counts as well.
-
-        Raises:
-            ValueError: if the directory holds a run that was made otherwise; the message says what differs.
+        A run whose files are damaged is none that was completed; a warning names the file. ``anyway`` lets a
+        run of other settings, source, modules, torch or compiler count as well; else ValueError is raised
+        where the directory holds a run that was made otherwise, and says what differs.
         """
         record = read(directory / RUN)
         if record is None or record.get("status") != COMPLETED:

@@ -65,17 +65,12 @@ def adp_problem(cfg: DictConfig) -> AdpProblem:
 
 
 def build(cfg: DictConfig, group: str, kind: type, **known: Callable[[], Any]) -> Any:
-    """Build the object of a group below `adp`, and hand over what its constructor asks for by name.
+    """Build the object of a group below `adp`, a node with ``_target_`` and arguments, which must be of a
+    kind.
 
-    Args:
-        cfg: the settings.
-        group: a node with ``_target_`` and arguments.
-        kind: the type that the object must have.
-        known: functions that make an argument: each is called only where the constructor has a parameter of
-            that name and the node does not give it.
-
-    Raises:
-        ValueError: if the node is not an option of its group, or the object is of another type.
+    Each function of ``known`` makes an argument, and is called only where the constructor has a parameter of
+    that name and the node does not give it. Raises ValueError if the node is no option of its group, or the
+    object is of another type.
     """
     node = cfg.adp[group]
     if not isinstance(node, DictConfig):

@@ -124,14 +124,9 @@ def _key(argument: object) -> object:
 
 
 def chase_problem(cfg: DictConfig | PlainSettings, parts: Parts | None = None) -> ChaseProblem:
-    """Build the gradient chase that the settings describe.
+    """Build the gradient chase that the settings describe; ``parts`` is the cache of a batch.
 
-    Args:
-        cfg: the settings.
-        parts: the cache of the batch, so that problems with equal settings share objects.
-
-    Raises:
-        ValueError: if a setting breaks its rule; the message names it.
+    Raises ValueError if a setting breaks its rule; the message names it.
     """
     parts = Parts() if parts is None else parts
     device, dtype = placement(cfg.device, cfg.dtype)
@@ -376,14 +371,10 @@ class LocalProblem(NamedTuple):
 
 
 def local_problem(cfg: DictConfig, states: str) -> LocalProblem:
-    """Build the first trajectory that the settings describe, at equally spaced times.
+    """Build the first trajectory of the settings, at as many equally spaced times as the setting of the name
+    ``states`` says.
 
-    Args:
-        cfg: the settings.
-        states: name of the setting that says at how many, `experiment.states`.
-
-    Raises:
-        ValueError: if a setting breaks its rule; the message names it.
+    Raises ValueError if a setting breaks its rule; the message names it.
     """
     problem = chase_problem(cfg)
     if cfg.centers.shrink.offset is not None:

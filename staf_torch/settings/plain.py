@@ -41,11 +41,7 @@ def plain(value: Any) -> Any:
 
 
 class ManySettings(Sequence[DictConfig]):
-    """The settings of many jobs: plain where that is possible, and OmegaConf's where one asks for them.
-
-    Args:
-        settings: of every job.
-    """
+    """The settings of many jobs: plain where that is possible, and OmegaConf's where one asks for them."""
 
     def __init__(self, settings: Sequence[DictConfig | PlainSettings]) -> None:
         self._settings = list(settings)

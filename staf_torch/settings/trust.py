@@ -46,11 +46,8 @@ def may_run_code(override: str) -> bool:
 
 
 def foreign_settings(settings: Any) -> list[str]:
-    """Return `key: value` of every setting of a run that needs trust, before any interpolation is resolved.
-
-    Args:
-        settings: dictionaries, lists and plain values, as `.hydra/config.yaml` has them.
-    """
+    """Return `key: value` of every setting of a run, as `.hydra/config.yaml` has them, that needs trust,
+    before any interpolation is resolved."""
     return [f"{key}: {value}" for key, value in _leaves(settings) if _is_foreign(key, value)]
 
 

@@ -134,11 +134,8 @@ class SweepDirectory(Callback):
 
 
 class SweepReport(Callback):
-    """Prints and saves the table of a sweep, draws its figures, and writes `report.html`, when it ends.
-
-    Args:
-        figures: whether to draw; None: as the runs do, by `figures` of the settings.
-    """
+    """Prints and saves the table of a sweep, draws its figures (None: as the runs do), and writes
+    `report.html`, when it ends."""
 
     def __init__(self, figures: bool | None = None) -> None:
         self._figures = figures
@@ -327,12 +324,9 @@ def _remove(directory: Path) -> None:
 
 
 def farewell(config: DictConfig | None, error: KeyboardInterrupt, said: str) -> str:
-    """Return what to say after Ctrl-C or another signal.
+    """Return what to say after the signal ``said``: how far the sweep was, and how to resume it.
 
-    Args:
-        config: of the sweep that was broken; None: a single run, or nothing had begun.
-        error: that broke it, with what a run has noted there.
-        said: which signal it was.
+    The error has what a run has noted there; ``config`` is None for a single run, or where nothing had begun.
     """
     notes = getattr(error, "__notes__", ())
     if config is None or notes:

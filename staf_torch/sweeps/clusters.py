@@ -30,16 +30,10 @@ _FINAL = {  # states that nobody should try again, and what they mean
 
 
 def executor(name: object, workers: int | None, arguments: Mapping[str, Any], directory: Path) -> Executor:
-    """Return the executor of that name in `hydra.launcher.executor`.
+    """Return the executor of a name of `EXECUTORS`, as `hydra.launcher.executor` has it.
 
-    Args:
-        name: one of `EXECUTORS`.
-        workers: tensor batches at once; None for as many as suit the executor.
-        arguments: of the libraries behind them, by the name of the executor.
-        directory: of the sweep.
-
-    Raises:
-        ValueError: for another name, or where the library behind it is not installed.
+    ``workers`` are tensor batches at once, None for as many as suit it, ``arguments`` those of the libraries,
+    by the executor's name. Raises ValueError for another name, or where the library is not installed.
     """
     choice("hydra.launcher", "executor", name, EXECUTORS)
     try:
@@ -58,10 +52,9 @@ def executor(name: object, workers: int | None, arguments: Mapping[str, Any], di
 class Submitit(Executor):
     """Run a tensor batch as a job of SLURM, or as a process of this machine (``cluster=local``).
 
-    Args:
-        workers: jobs at once; None: one a core on this machine, any number on a cluster.
-        directory: of the sweep; submitit keeps its files in `.submitit` there.
-        arguments: of `submitit.AutoExecutor.update_parameters`, and `cluster` and `folder`.
+    Jobs at once are one a core on this machine and any number on a cluster, unless ``workers`` says so;
+    submitit keeps its files in `.submitit` of the sweep's directory. ``arguments`` are those of
+    `submitit.AutoExecutor.update_parameters`, and `cluster` and `folder`.
     """
 
     def __init__(self, workers: int | None, directory: Path, arguments: Mapping[str, Any]) -> None:
@@ -128,11 +121,8 @@ def _fresh(wanted: str | None, directory: Path) -> Path:
 
 
 class Task:
-    """Solves a batch within a job.
-
-    Args:
-        parent: process of the command, and its `beginning`, with which a job on the same machine ends.
-    """
+    """Solves a batch within a job, which ends with its parent: the process of the command on the same
+    machine, and its `beginning`."""
 
     def __init__(self, parent: tuple[int, str] | None) -> None:
         self._parent = parent
@@ -185,12 +175,8 @@ def _last_of_trace(said: str) -> str:
 
 
 class Ray(Executor):
-    """Run a tensor batch as a task of Ray with one core, on this machine or on a Ray cluster.
-
-    Args:
-        workers: tasks at once; None for as many as Ray has cores.
-        arguments: of `ray.init`.
-    """
+    """Run a tensor batch as a task of Ray with one core, on this machine or on a Ray cluster; as many at once
+    as Ray has cores, unless ``workers`` says so."""
 
     def __init__(self, workers: int | None, arguments: Mapping[str, Any]) -> None:
         super().__init__(workers)

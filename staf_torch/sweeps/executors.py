@@ -59,8 +59,7 @@ def compute(
     a sweep that was interrupted ends with the very numbers that it would have had.
 
     Args:
-        settings: of every job.
-        flat: the same by dotted keys.
+        settings: of every job; ``flat`` has the same by dotted keys.
         directories: of every run, by its index.
         workers: compute the batches.
         finished: indices of jobs that need no outcome.
@@ -98,11 +97,7 @@ def compute(
 
 
 class Executor(abc.ABC):
-    """Tensor batches, some at once. A context: leaving it ends what still runs.
-
-    Args:
-        workers: batches at once; None for as many as suit the executor.
-    """
+    """Tensor batches, some at once (None: as many as suit it). A context: leaving it ends what still runs."""
 
     def __init__(self, workers: int | None = None) -> None:
         if workers is not None:
@@ -257,12 +252,10 @@ def unpack(pickled: bytes) -> Done:
 
 
 def solve_elsewhere(pickled: bytes, path: Sequence[str], packages: Sequence[str] = ()) -> bytes:
-    """Compute a tensor batch in a process that has only just begun, and return the pickled `Done`.
+    """Compute a pickled `Batch` in a process that has only just begun, and return the pickled `Done`.
 
-    Args:
-        pickled: a `Batch`.
-        path: `sys.path` of the command, which may lead to a user's own modules.
-        packages: those whose objects the command's settings may name.
+    It gets the command's `sys.path`, which may lead to a user's own modules, and the packages whose objects
+    the command's settings may name.
     """
     sys.path[:] = [*path, *(entry for entry in sys.path if entry not in path)]
     start = time.monotonic()

@@ -46,16 +46,8 @@ def execute(
 ) -> Metrics | float | tuple[float, ...]:
     """Run the job that Hydra has prepared, fill its directory, and return what the sweeper is told.
 
-    `run.json` says how the job ends.
-
-    Args:
-        cfg: all settings but Hydra's.
-        outcome: what was computed for the job already.
-        seconds: that were spent on it.
-        progress: shows how far long loops are.
-
-    Raises:
-        Exception: that of the experiment; the record has its reason.
+    ``outcome`` is what was computed for it already, in so many ``seconds``. `run.json` says how the job ends;
+    an exception is that of the experiment, and the record has its reason.
     """
     about = About.now()
     directory, choices = about.directory, about.choices

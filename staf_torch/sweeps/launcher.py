@@ -54,12 +54,7 @@ def _collecting_seldom() -> Iterator[None]:
 
 
 class SweepProgress:
-    """Jobs that are done and that failed, and the time left, on stderr.
-
-    Args:
-        total: jobs.
-        done: of them, from before.
-    """
+    """Jobs that are done (some from before) and that failed, and the time left, on stderr."""
 
     def __init__(self, total: int, done: int = 0) -> None:
         self._total, self._before, self._done, self._failed = total, done, done, 0
@@ -126,9 +121,7 @@ def job_name(num: int, overrides: Sequence[str]) -> str:
 class AlikeFailures:
     """Failures that have nothing to do with what is swept: all jobs so far have one reason.
 
-    Args:
-        jobs: the overrides of all jobs.
-        first: the number of the first.
+    It gets the overrides of all jobs, and the number of the first.
     """
 
     def __init__(self, jobs: Sequence[Sequence[str]], first: int = 0) -> None:
@@ -171,11 +164,7 @@ def _differing(jobs: Iterable[Sequence[str]]) -> set[int]:
 
 
 class Launch:
-    """A call by Hydra: a list of jobs to run.
-
-    Args:
-        launcher: the plugin, with its settings and what Hydra set up.
-    """
+    """A call by Hydra: a list of jobs to run, by the launcher's settings and what Hydra set up."""
 
     def __init__(self, launcher: Any) -> None:
         self._launcher = launcher

@@ -24,18 +24,12 @@ class TakenError(ValueError):
 
 
 class DirectoryLock:
-    """The lock of a directory of a run or sweep, held until `release`, or until this process ends anyhow.
+    """The lock of a directory of a run or sweep, which exists, held until `release`, or until this process
+    ends anyhow.
 
     On one machine the kernel knows whether the owner lives. Between machines that share the disk without
-    sharing locks, the owner touches the file every half a minute.
-
-    Args:
-        directory: of the run or sweep; it exists.
-        kind: run or sweep.
-
-    Raises:
-        TakenError: if another one has it.
-        OSError: if the directory cannot be written.
+    sharing locks, the owner touches the file every half a minute. Raises TakenError if another one has it,
+    OSError if the directory cannot be written.
     """
 
     def __init__(self, directory: Path, kind: str = "sweep") -> None:

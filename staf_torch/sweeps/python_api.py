@@ -340,11 +340,8 @@ class Runs:
         return self._with(rows)
 
     def filter(self, *conditions: str | Callable[[Run], bool]) -> Runs:
-        """Return the runs for which all conditions hold.
-
-        Args:
-            conditions: settings as they are typed, `"kernel=gaussian"`, or functions of a run.
-        """
+        """Return the runs for which all conditions hold: settings as typed, `"kernel=gaussian"`, or functions
+        of a run."""
         kept: Iterable[Run] = self
         for condition in conditions:
             if callable(condition):

@@ -31,20 +31,15 @@ _BOLD, _ON_THE_PAGE = Style(bold=True), Style(digits=4, bold=True)
 
 
 def write_report(directory: Path, *, figures: bool = True) -> str:
-    """Write `table.md`, `table.tex`, `table.csv`, `figures/` and `report.html` of the sweep in a directory.
+    """Write `table.md`, `table.tex`, `table.csv`, `figures/` and `report.html` of the sweep in a directory;
+    return the table in Markdown.
 
     The first two and the page have one row for all seeds, where more than one was swept; the CSV has one row
     a run and all metrics, its directory as seen from the sweep's. A figure that cannot be drawn is a warning
-    in the log.
+    in the log. Of a table with more than a thousand rows `table.md` and the page have the spread of each
+    metric.
 
-    Of a table with more than a thousand rows `table.md` and the page have the spread of each metric.
-
-    Returns:
-        The table in Markdown.
-
-    Raises:
-        ValueError: if there is no run in the directory.
-        OSError: if it cannot be written.
+    Raises ValueError if there is no run in the directory, OSError if it cannot be written.
     """
     out = RunDirectory(directory)
     if (directory / ROWS).exists() and next(itertools.islice(read_rows(directory), _MOST_ROWS, None), None):
@@ -129,11 +124,7 @@ def _all(texts: Iterable[str | None]) -> str:
 
 
 def draw_sweep(found: Collection, out: RunDirectory) -> dict[str, bytes]:
-    """Draw the figures that the swept settings allow.
-
-    Returns:
-        What each shows, and its PNG.
-    """
+    """Draw the figures that the swept settings allow; return what each shows, and its PNG."""
     drawn = {}
     for name, (what, draw) in SWEEP_FIGURES.items():
         try:
@@ -157,13 +148,8 @@ def page(
 ) -> str:
     """Return `report.html`: one file with the table, the figures and the settings, linked to the runs.
 
-    Args:
-        found: the runs.
-        table: of them.
-        figures: what each shows, and its PNG.
-        title: heading of the page.
-        about: the line below it; None: how many runs of what there are.
-        facts: of `facts`.
+    ``figures`` has what each shows, and its PNG; ``about`` is the line below the title, by default how many
+    runs of what there are.
     """
     import jinja2  # the callbacks of every run import this module
 

@@ -96,12 +96,7 @@ def _confirm(directory: Path, foreign: Sequence[str]) -> None:
 def recorded(directory: Path, *, anyway: bool = False) -> tuple[list[str], list[str]]:
     """Return the overrides of a sweep as they were typed: the jobs' own, and Hydra's.
 
-    Args:
-        directory: of the sweep.
-        anyway: whether one of another version will do.
-
-    Raises:
-        ValueError: if no sweep of this version is there.
+    Raises ValueError if no sweep is there, or one of another version, which ``anyway`` allows.
     """
     record = records.read(directory / records.SWEEP)
     if record is None or not _texts(record.get("overrides")) or not _texts(record.get("hydra")):

@@ -71,8 +71,7 @@ def fill(
         jobs: compose the settings.
         overrides: of every job.
         directory: of the sweep.
-        executor: computes tensor batches.
-        most: jobs of a batch at most.
+        executor: computes tensor batches, of ``most`` jobs at most.
         ended: is told the number of every job that has a row, and why it failed, None where it did not.
         tell: is told how many jobs are computed.
 
@@ -160,14 +159,8 @@ class _RowsToFill(NamedTuple):
     tell: Callable[[float], None]
 
     def compute(self, begin: int, done: int, write: Write, completed: list[int]) -> int:
-        """Compute the jobs of a piece and write the rows from ``done`` on; return how many were lost.
-
-        Args:
-            begin: number of the first job.
-            done: rows that are written.
-            write: appends rows.
-            completed: takes the number of rows after each.
-        """
+        """Compute the jobs of a piece, from number ``begin`` on, and write the rows from ``done`` on; return
+        how many were lost. ``completed`` takes the number of rows after each."""
         cfgs, flat = self.pieces.taken(begin)
         rows, lost = _InOrder(write, [made_by(one) for one in flat], max(0, done - begin)), 0
 
@@ -199,10 +192,7 @@ class _RowsToFill(NamedTuple):
 class _InOrder:
     """Writes the rows of a piece in their order, a thousand at a time; batches may end in another one.
 
-    Args:
-        write: appends rows.
-        made: what made each row of the piece.
-        written: rows of it that are written already.
+    It gets what made each row of the piece, and how many are written already.
     """
 
     def __init__(self, write: Write, made: list[str], written: int) -> None:
@@ -294,15 +284,8 @@ def made_by(settings: Mapping[str, Any]) -> str:
 
 
 def left(directory: Path, run: str) -> Left | None:
-    """Return the rows that an earlier start has left, up to the first that is not whole or lost its worker.
-
-    Args:
-        directory: of the sweep.
-        run: hash of what makes the rows.
-
-    Returns:
-        The rows; None where something else made them.
-    """
+    """Return the rows that an earlier start has left, up to the first that is not whole or lost its worker;
+    None where something else made them than the hash ``run`` says."""
     partial, found = directory / partial_name(ROWS), Left([])
     if not os.path.lexists(directory / SUMS) or not os.path.lexists(partial):
         return found
@@ -349,11 +332,8 @@ def _rows(path: Path, count: int) -> Iterator[dict[str, Any]]:
 def _writer(directory: Path, run: str, total: int, before: Left) -> Iterator[Write]:
     """Yield a function that appends rows to `rows.json`, with what made each of them.
 
-    Args:
-        directory: of the sweep.
-        run: hash of what makes the rows.
-        total: rows in the end.
-        before: rows that stay; what the files have after them is cut off.
+    ``run`` is the hash of what makes the rows, ``total`` their number in the end; what the files have after
+    the rows ``before`` is cut off.
     """
     done = len(before.made)
 

@@ -29,11 +29,7 @@ _END = 5.0  # s that a process has to end when it is asked to
 
 
 class Stopped(KeyboardInterrupt):
-    """A signal that asks the program to end; nothing that only handles errors catches it.
-
-    Args:
-        number: of the signal.
-    """
+    """A signal of that number that asks the program to end; nothing that only handles errors catches it."""
 
     def __init__(self, number: int) -> None:
         super().__init__(number)
@@ -94,11 +90,7 @@ class LostError(Exception):
 
 
 class Worker:
-    """A fresh process that computes one thing after the other.
-
-    Args:
-        work: a function of a module, called in the process.
-    """
+    """A fresh process that computes one thing after the other, by a function of a module."""
 
     def __init__(self, work: Callable[..., bytes]) -> None:
         context = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
@@ -182,10 +174,8 @@ def beginning(pid: int) -> str:
 def end_with(pid: int, began: str | None = None, *, parent: bool = False) -> None:
     """Let this process be killed when another one of this machine ends.
 
-    Args:
-        pid: of the other.
-        began: its `beginning`; None: that of the process that has the number now.
-        parent: whether it is the direct parent, which the kernel can watch on Linux.
+    ``began`` is the other's `beginning`, None that of the process that has the number now; a direct
+    ``parent`` is watched by the kernel on Linux.
     """
     if parent and sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)

@@ -226,11 +226,9 @@ class Table:
 
     @classmethod
     def of(cls, rows: Sequence[Mapping[str, Value]], headings: Mapping[str, str] | None = None) -> Table:
-        """Return a table of rows that have been computed.
+        """Return a table of rows that have been computed, in which a missing cell is None.
 
-        Args:
-            rows: one mapping a row; a missing cell is None.
-            headings: key of a column to its heading, in order; None: the keys themselves, all of them.
+        ``headings`` has the heading of each column, in order; None: the keys themselves, all of them.
         """
         named = headings or {key: "" for row in rows for key in row}
         columns = tuple(Column(key, heading=heading) for key, heading in named.items())
@@ -278,14 +276,8 @@ class Table:
     def texts(
         self, escape: Callable[[str], str], number: Callable[[Number], str], missing: str, bold: str
     ) -> list[list[str]]:
-        """Return the cells row by row as a format for people writes them.
-
-        Args:
-            escape: of a text.
-            number: writes a number.
-            missing: what stands for None.
-            bold: with braces for the best number of a column.
-        """
+        """Return the cells row by row as a format for people writes them: texts by ``escape``, numbers by
+        ``number``, None as ``missing``, the best number of a column within the braces of ``bold``."""
 
         def text(column: PrintedColumn, row: int) -> str:
             cell = column.cells[row]

@@ -32,16 +32,13 @@ _NEEDED = ("mkdocs", "material", "mkdocstrings", "mkdocstrings_handlers")
 
 @Sign("building the site", log=False)
 def main(words: Sequence[str]) -> str:
-    """Build the site into a folder, `site` where none is named; return where it begins.
+    """Build the site into a folder, `site` where none is named, with reference pages of the rooms that the
+    further words name, all of `ROOMS` by default; return where it begins.
 
     The pages are in a folder named after the version, 0.2; `latest` leads to the version built last.
 
-    Args:
-        words: the folder, then the rooms that get reference pages, all of `ROOMS` by default.
-
-    Raises:
-        ValueError: without the extra `docs`, for a room that has no pages, where a site would take the place
-            of something else, or if the generator warns.
+    Raises ValueError without the extra `docs`, for a room that has no pages, where a site would take the
+    place of something else, or if the generator warns.
     """
     rooms = tuple(words[1:]) or tuple(ROOMS)
     if unknown := [room for room in rooms if room not in ROOMS]:

@@ -200,15 +200,9 @@ def _beginning(places: list[str], folder: Path) -> str:
 
 
 def _linked(text: str, place: str, places: list[str], folder: Path, at: str | None = None) -> str:
-    """Return a page with links as they are on the site; files that it links to are copied there.
-
-    Args:
-        text: of the page.
-        place: where it lies in the repository.
-        places: those of all pages.
-        folder: of the site's pages.
-        at: the folder of the page on the site, where it is another one.
-    """
+    """Return a page that lies at a ``place`` of the repository with links as they are on the site; files that
+    it links to are copied into the folder of the site's pages. ``at`` is the folder of the page there, where
+    it is another one."""
     home = PurePosixPath(place).parent.as_posix()
     shown_at = home if at is None else at
 

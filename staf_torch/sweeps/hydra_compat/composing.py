@@ -91,10 +91,7 @@ class _Composed(NamedTuple):
 class Composer:
     """The configurations of a program by their overrides, as its loader composes them; else, that loader.
 
-    Args:
-        loader: Hydra's, of the program.
-        config_name: of the primary configuration.
-        searched: folders that the primary configuration itself adds to Hydra's search path.
+    ``searched`` are folders that the primary configuration itself adds to Hydra's search path.
     """
 
     def __init__(

@@ -40,9 +40,7 @@ Plan = tuple[ManySettings, Sequence[Mapping[str, Any]]]
 class SweepJobs:
     """The jobs of a sweep whose launcher is ours, composed by a `Composer`; for the rest, Hydra's own loader.
 
-    Args:
-        context: of the sweep, as Hydra hands it to a launcher; from now on it has this loader.
-        master: settings of the sweep.
+    The context of the sweep, as Hydra hands it to a launcher, has this loader from now on.
     """
 
     def __init__(self, context: HydraContext, master: DictConfig) -> None:
@@ -116,14 +114,7 @@ class SweepJobs:
         return self.choices.get("hydra/sweeper") == "basic" and sweeper.get("max_batch_size") is None
 
     def job(self, num: int, overrides: Sequence[str], plan: Plan | None = None, index: int = 0) -> Job:
-        """Return job ``num``.
-
-        Args:
-            num: of the job.
-            overrides: of the job.
-            plan: what `many` returned, of this job among others.
-            index: of the job there.
-        """
+        """Return job ``num``, which is the one of that index in the plan that `many` returned."""
         plain, flat = (None, None) if plan is None else (plan[0].plain(index), plan[1][index])
         settings = self.settings if plain is None else lambda _: plan[0].made(index)  # type: ignore[index]
         return Job(self, num, overrides, settings, plain, flat)
@@ -222,15 +213,8 @@ class SweepJobs:
 class Job:
     """A job of a sweep; its configuration with Hydra's node is composed where somebody asks for it.
 
-    While it runs `HydraConfig.get()` returns its node.
-
-    Args:
-        jobs: all of the sweep.
-        num: of the job.
-        overrides: of the job.
-        settings: composes the settings by the overrides.
-        plain: the settings as a tree, where they are known so.
-        flat: the same by dotted keys.
+    While it runs `HydraConfig.get()` returns its node. ``settings`` composes the settings by the overrides;
+    ``plain`` and ``flat`` are the settings as a tree and by dotted keys, where they are known so.
     """
 
     def __init__(
