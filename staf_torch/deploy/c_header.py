@@ -27,11 +27,10 @@ from ..lanes.tree import Tree, flatten, labels
 from ..numerics.checks import fail
 from ..signs import Sign
 from .controllers import FilteredPolicy, SupervisedPolicy, check_bounded, in_dtype, searches
-from .data_sheet import Latency
+from .data_sheet import Latency, Source, counted
 from .formats import Run, as_tuple
 from .names import check_count, check_dtype, function_name, listed_names
 from .remembered_policy import RememberedPolicy
-from .scalar_program import Source, counted
 
 _log = logging.getLogger(__name__)
 

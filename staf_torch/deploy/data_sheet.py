@@ -8,12 +8,15 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.export import ExportedProgram
 
+from ..lanes.emit.schedule import Schedule
+from ..lanes.trace.graph import FIXED
+from ..lanes.trace.step import Traced
 from ..results.files import visible
 from ..signs import Sign
 
@@ -196,3 +199,39 @@ def _named(path: str) -> str:
 
 def _shape(size: int | None) -> str:
     return "(B,)" if size is None else f"(B, {size})"
+
+
+_CHEAP_SCALARS = set("add sub mul div lt le eq ne and or xor neg abs min max not where sqrt".split())  # noqa: SIM905
+_FREE_SCALARS = set("const param elem result collect carry state row now load pack cast loop".split())  # noqa: SIM905
+
+
+class Source(NamedTuple):
+    """Cost of a call of a header."""
+
+    constants: int  # numbers in it
+    flops: int
+    functions: int  # calls of exp and the like
+
+    def work(self, entries: int, dtype: torch.dtype) -> Work:
+        """Return the cost in the words of `staf-export`, with as many entries of all inputs and outputs."""
+        size = dtype.itemsize
+        return Work(self.constants, self.flops, self.functions, self.constants * size, entries * size)
+
+
+def counted(traced: Traced) -> Source:
+    """Return the cost of a call: loops have fixed lengths, and both sides of a choice are computed."""
+    graph, _, following, ends = traced.program
+    schedule = Schedule(graph, following, ends)
+    constants = flops = functions = 0
+    for node in schedule.live:
+        op, count = graph.op[node], schedule.repeats(node)
+        constants += op in FIXED
+        if op in ("map", "dot"):
+            aux = graph.aux[node]
+            count *= math.prod(aux[1]) if op == "map" else 2 * aux[0] * aux[1]
+            op = aux[0] if op == "map" else "add"
+        if op in _CHEAP_SCALARS:
+            flops += count
+        elif op not in _FREE_SCALARS:
+            functions += count
+    return Source(constants, flops, functions)

@@ -19,10 +19,10 @@ from torch.export import ExportedProgram
 
 from ..numerics.checks import fail, integer, trailing
 from ..signs import Sign
+from .data_sheet import Source
 from .graph import trace
 from .names import check_count, check_dtype, function_name, listed_names
 from .onnx_writer import OnnxWriter
-from .scalar_program import Source
 
 FORMAT = 1
 """Of the note inside a .pt2 file; raised when an older reader would go wrong."""

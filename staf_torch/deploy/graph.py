@@ -1,10 +1,11 @@
-"""A module as one graph of tensor operations: what every format starts from."""
+"""A module as one graph of tensor operations, which every format starts from; a step of it as scalars."""
 
 from __future__ import annotations
 
 import math
 import operator
 import warnings
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import torch
@@ -13,6 +14,11 @@ from torch._decomp import core_aten_decompositions
 from torch.export import Dim, ExportedProgram
 from torch.fx.experimental.proxy_tensor import make_fx
 
+from ..lanes.calls.inputs import Given
+from ..lanes.trace.row_independence import doubt
+from ..lanes.trace.step import Step, Traced
+from ..lanes.trace.step import trace as trace_step
+from ..lanes.trace.tracer import NotLoweredError
 from ..numerics.checks import fail, integer, trailing
 
 _TRACED = 3  # rows of the batch while tracing: a size that no other dimension is taken for by chance
@@ -135,3 +141,16 @@ def lift_numbers(graph: fx.GraphModule) -> fx.GraphModule:
 
 def _inexact(value: float) -> bool:
     return math.isfinite(value) and torch.tensor(value, dtype=torch.float32, device="cpu").item() != value
+
+
+def traced_row(step: Step, row: Mapping[str, Tensor]) -> Traced | None:
+    """Return the trace of a step of a row without a carry, (1, ...); None where it has no scalar form."""
+    two = {key: part.expand(2, *part.shape[1:]).contiguous() for key, part in row.items()}
+    given = Given.of((), (), two, 1)
+    try:
+        traced = trace_step(step, given, folded=True)
+    except NotLoweredError:
+        return None
+    real = next(iter(row.values())).dtype
+    plain = all(len(shape) < 2 and dtype == real for shape, dtype in traced.outputs)
+    return traced if plain and doubt(step, given) is None else None

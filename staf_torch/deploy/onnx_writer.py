@@ -19,8 +19,9 @@ from ..lanes.trace.graph import FLAG, NARROW, ROW, STEP, WIDE
 from ..lanes.trace.step import Traced
 from ..lanes.tree import Tree
 from .controllers import FilteredPolicy, searches
+from .data_sheet import Source, counted
+from .graph import traced_row
 from .remembered_policy import RememberedPolicy
-from .scalar_program import Source, counted, traced_row
 
 _OPSET, _IR = 18, 8
 _BINARY = {"add": "Add", "sub": "Sub", "mul": "Mul", "div": "Div", "pow": "Pow", "lt": "Less", "eq": "Equal"}

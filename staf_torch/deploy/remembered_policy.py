@@ -13,7 +13,7 @@ from ..adp.planning.global_value import follow_plan
 from ..lanes.trace.step import Step
 from ..lanes.tree import Tree
 from ..numerics.checks import hold
-from .scalar_program import Source
+from .data_sheet import Source
 
 
 class RememberedPolicy(nn.Module):

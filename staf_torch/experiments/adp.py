@@ -170,7 +170,7 @@ def solve(problem: AdpProblem, progress: Progress = SHOWN) -> LoopResult:
 def simulate_together(
     problems: Sequence[AdpProblem], progress: Callable[[int], None] | None = None
 ) -> list[LoopResult]:
-    """Run problems, at least one; those that differ in numbers alone are one loop with numbers of each row."""
+    """Run problems, at least one; those that differ in numbers alone are one loop with numbers of rows."""
 
     def run(
         jobs: Sequence[int], objects: Any, rows: RowsOfJobs, advance: Callable[[int], None] | None

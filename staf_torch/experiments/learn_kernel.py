@@ -15,7 +15,6 @@ from torch import Tensor
 
 from ..approximation.basis import StaFBasis
 from ..centers import ConstantRadius, StateFollowingCenters, probe_points
-from ..engine import chase
 from ..figures.chase import LearnedKernel, draw_learned_kernel
 from ..figures.style import draws
 from ..kernels import Kernel
@@ -54,14 +53,7 @@ class Learning(NamedTuple):
         (B,). Width and radius are numbers, or `rows` of one for each trajectory."""
         problem, kernel = self.problem, self.kernel(width)
         centers = StateFollowingCenters(problem.basis.centers.directions, ConstantRadius(radius))
-        found = chase(
-            states,
-            StaFBasis(kernel, centers),
-            problem.target,
-            problem.law,
-            inner_steps=problem.inner_steps,
-            predictor=problem.predictor,
-        )
+        found = problem.chase(states, basis=StaFBasis(kernel, centers))
         x, b = states[:, self.first :], found.coefficients[:, self.first :]
         z = self.offsets.expand(*x.shape[:-1], -1, -1)
         gap = problem.target(x.unsqueeze(-2) + z) - evaluate_scaled(kernel, centers.offsets(x), x, z, b)

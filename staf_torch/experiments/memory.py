@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from ..centers import probe_points
-from ..engine import ChaseResult, chase
+from ..engine import ChaseResult
 from ..figures.chase import MemoryPicture, draw_memory
 from ..figures.style import draws
 from ..numerics.checks import COMMAND_LINE, fail, integer, positive_real
@@ -63,7 +63,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     if not 0 <= first < problem.steps:
         raise fail(COMMAND_LINE, "settle_time", "must lie within the duration", problem.settle_time)
     states = simulate(problem.system, problem.initial_states, dt=problem.dt, steps=problem.steps)
-    found = _chase(problem, states)
+    found = problem.chase(states)
     coefficients = problem.basis.local(states).coefficients(found.weights)
     memory = remember(problem, settings, states[:, first:], coefficients[:, first:], progress)
     index = first + (torch.arange(settings.states, device="cpu") * (problem.steps - first)) // settings.states
@@ -141,7 +141,7 @@ def revisits(
     }
     excess = {}
     for name, start in chosen.items():
-        again = _chase(problem, pieces.flatten(0, 1), start.flatten(0, 1))
+        again = problem.chase(pieces.flatten(0, 1), start.flatten(0, 1))
         excess[name] = again.excess.unflatten(0, pieces.shape[:2])
     return Revisits(excess, found.excess[:, first:].amax(-1))
 
@@ -163,18 +163,6 @@ def summary(memory: ExperienceMemory, region: Region, again: Revisits) -> Metric
         taken = torch.where(done.any(-1), done.to(torch.int8).argmax(-1) + 1.0, torch.nan).max()
         found[f"revisit_steps_{name}"] = finite(taken)
     return found
-
-
-def _chase(problem: ChaseProblem, states: Tensor, weights: Tensor | None = None) -> ChaseResult:
-    return chase(
-        states,
-        problem.basis,
-        problem.target,
-        problem.law,
-        inner_steps=problem.inner_steps,
-        predictor=problem.predictor,
-        weights=weights,
-    )
 
 
 def _shown(metrics: dict[str, float | None]) -> list[Table]:

@@ -10,6 +10,7 @@ import numpy as np
 from .loop import bounds, by_unit, with_unit
 from .style import (
     against_time,
+    at_left,
     colour,
     curves,
     dash,
@@ -392,8 +393,7 @@ def draw_rivals(rows: Sequence[Mapping[str, Any]]) -> Figure:
                         handles[row["method"]] = point
             axes.set(xscale="log", yscale="log", xlabel=r"time a control ($\mu$s)")
             axes.set_title(plant.replace("_", " "))
-            spec = axes.get_subplotspec()
-            if spec is not None and spec.is_first_col():
+            if at_left(axes):
                 axes.set_ylabel("median excess cost")
         legend(*grid, handles=[handles[name] for name in methods], title="hollow: not all regulated")
     return figure

@@ -427,6 +427,12 @@ def against_time(grid: Iterable[Axes], time: np.ndarray) -> None:
         axes.set(xlabel="time (s)", xlim=(time[0], time[-1]))
 
 
+def at_left(axes: Axes) -> bool:
+    """Return whether a panel stands at the left edge."""
+    spec = axes.get_subplotspec()
+    return spec is not None and spec.is_first_col()
+
+
 def ticks(axes: Axes, name: str, values: Iterable[float]) -> None:
     """Give the logarithmic axis ``name`` ("x" or "y") these values alone, numbers where there is room."""
     at = sorted(values)

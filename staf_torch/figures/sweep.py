@@ -16,7 +16,7 @@ from ..results.files import grouped
 from ..results.reader import Collection, RecordedRun, identity
 from ..results.run import CLASS_PATH, as_text, class_name
 from ..tables.aggregate import half_width, mean, rank
-from .style import colour, dash, legend, marker, panels, ticks
+from .style import at_left, colour, dash, legend, marker, panels, ticks
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -348,8 +348,7 @@ def _short(error: float) -> str:
 
 def _label_left(grid: Sequence[Axes], label: str = _ERROR) -> None:
     for axes in grid:
-        spec = axes.get_subplotspec()
-        if spec is not None and spec.is_first_col():
+        if at_left(axes):
             axes.set_ylabel(label)
 
 

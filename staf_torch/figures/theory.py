@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from .style import colour, dash, legend, letter, marker, panels, positive, ticks
+from .style import at_left, colour, dash, legend, letter, marker, panels, positive, ticks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -67,8 +67,7 @@ def draw_exponential_bound(found: Mapping[tuple[float, float], Mapping[str, floa
             _bounds(axes, {epsilon: row for (r, epsilon), row in found.items() if r == radius})
             axes.set_title(f"$r = {radius:g}$")
             axes.set_xlabel(r"largest error $\epsilon$")
-            spec = axes.get_subplotspec()
-            if spec is not None and spec.is_first_col():
+            if at_left(axes):
                 axes.set_ylabel("kernels $M$")
         _plain_ticks(grid[0], found)
         legend(*grid)
@@ -106,7 +105,7 @@ def draw_feasibility(found: Feasibility) -> Figure:
         left.set_yscale("log")
         ticks(left, "y", found.counts)
         left.set_ylabel("centers $M$")
-        right.set_ylabel("centers $M$" if _stacked(right) else "")
+        right.set_ylabel("centers $M$" if at_left(right) else "")
         left.set_xlabel(label)
         left.margins(x=0)
         right.set_xscale("log")
@@ -115,12 +114,6 @@ def draw_feasibility(found: Feasibility) -> Figure:
         letter((left, right), f"at each state, $r = {found.radius:g}$", "along the whole trajectory")
         legend(right, left)
     return figure
-
-
-def _stacked(axes: Axes) -> bool:
-    """Return whether the panel stands at the left edge."""
-    spec = axes.get_subplotspec()
-    return spec is not None and spec.is_first_col()
 
 
 def _place(found: Feasibility) -> tuple[np.ndarray, str]:
@@ -148,7 +141,7 @@ def draw_layouts(found: Sequence[LayoutCurve], radius: float, radii: np.ndarray)
         ticks(right, "x", radii)
         right.set_xlabel("radius $r$ of the ball")
         legend(right, title="layout, $M$: slope")
-        right.set_ylabel(left.get_ylabel() if _stacked(right) else "")
+        right.set_ylabel(left.get_ylabel() if at_left(right) else "")
         letter((left, right), f"$r = {radius:g}$", "slopes in $r$")
     return figure
 
@@ -195,7 +188,7 @@ def draw_errors(panels_: Sequence[ErrorPanel], rows: int) -> Figure:
         for axes, panel in zip(grid, panels_, strict=True):
             _errors(axes, panel)
             axes.set_xlabel("radius $r$")
-            if _stacked(axes):
+            if at_left(axes):
                 axes.set_ylabel(r"relative error of $\hat V$")
         letter(grid, *(panel.title for panel in panels_))
         drawn = {str(line.get_label()): line for axes in grid for line in axes.get_lines()}

@@ -29,6 +29,7 @@ from ..centers import (
     rings,
     simplex,
 )
+from ..engine import ChaseResult, chase
 from ..engine.predictors import Predictor
 from ..kernels import Kernel
 from ..metrics import Metric
@@ -59,6 +60,20 @@ class ChaseProblem:
     predictor: Predictor | None = None
     certificate: bool = False
     metrics: tuple[Metric, ...] = ()  # of the user's own
+
+    def chase(
+        self, states: Tensor, weights: Tensor | None = None, basis: StaFBasis | None = None
+    ) -> ChaseResult:
+        """Chase along states (B, T, n) from weights (B, M), by its own basis unless another is given."""
+        return chase(
+            states,
+            self.basis if basis is None else basis,
+            self.target,
+            self.law,
+            inner_steps=self.inner_steps,
+            predictor=self.predictor,
+            weights=weights,
+        )
 
 
 def load(path: str, arguments: dict[str, Any] | None = None, *, inner_steps: int | None = None) -> Any:

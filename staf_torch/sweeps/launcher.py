@@ -175,38 +175,25 @@ class Launch:
         if launcher.batch is not None:
             integer("hydra.launcher", "batch", launcher.batch, least=1)
         choice("hydra.launcher", "foreign", launcher.foreign, _FOREIGN)
-        self._in_table = records.in_table(self._jobs.master)
-        if self._task is not execute and (launcher.foreign == "refuse" or self._in_table):
-            why = "sweep.records=table" if self._in_table else "hydra.launcher.foreign=refuse"
+        self.in_table = records.in_table(self._jobs.master)
+        if self._task is not execute and (launcher.foreign == "refuse" or self.in_table):
+            why = "sweep.records=table" if self.in_table else "hydra.launcher.foreign=refuse"
             raise ValueError(f"`{why}`: {_NOT_BATCHED}")
-        if self._in_table and not self._jobs.at_once:
+        if self.in_table and not self._jobs.at_once:
             raise ValueError(
                 "`sweep.records=table` needs all jobs at once: hydra/sweeper=basic without max_batch_size."
             )
-
-    def run(self, job_overrides: Sequence[Sequence[str]], first: int) -> list[JobReturn]:
-        """Run the jobs, numbered from ``first``, and return Hydra's records of them, in order.
-
-        Where they leave rows of a table there are none of those records.
-
-        Raises:
-            ValueError: if a row failed, when all have ended.
-        """
         self._jobs.start()
         if not PRINTS.get():
             silence_terminal()
         self._refuse_the_other_kind()
-        if self._in_table:
-            self._fill_table(job_overrides)
-            return []
-        return self._fill_directories({first + i: list(one) for i, one in enumerate(job_overrides)})
 
     def _refuse_the_other_kind(self) -> None:
         """Raise ValueError if a sweep of directories is resumed as a table, or the other way round."""
         names = (ROWS, partial_name(ROWS))
         rows = any((self._directory / name).exists() for name in names)
         runs = next(self._directory.glob(f"*/{RUN}"), None) is not None
-        if (runs and self._in_table) or (rows and not self._in_table):
+        if (runs and self.in_table) or (rows and not self.in_table):
             raise ValueError(
                 f"{self._directory} was begun with the other value of `sweep.records`, which a sweep keeps."
             )
@@ -215,7 +202,8 @@ class Launch:
         about = self._launcher
         return executor(about.executor, about.workers, about.arguments, self._directory)
 
-    def _fill_table(self, jobs: Sequence[Sequence[str]]) -> None:
+    def fill_table(self, jobs: Sequence[Sequence[str]]) -> None:
+        """Run the jobs, which leave rows of a table; raise ValueError if one failed, when all have ended."""
         progress = SweepProgress(len(jobs))
         done, failed, alike = 0, [], AlikeFailures(jobs)
 
@@ -239,7 +227,9 @@ class Launch:
             num, why = failed[0]
             raise ValueError(f"{len(failed)} of {len(jobs)} jobs failed; {job_name(num, jobs[num])}: {why}")
 
-    def _fill_directories(self, numbered: Mapping[int, list[str]]) -> list[JobReturn]:
+    def fill_directories(self, jobs: Sequence[Sequence[str]], first: int) -> list[JobReturn]:
+        """Run the jobs, numbered from ``first``, and return Hydra's records of them, in order."""
+        numbered = {first + i: list(one) for i, one in enumerate(jobs)}
         plan = self._jobs.many(list(numbered.values()))  # before anything is written
         self._jobs.refuse_shared(numbered)
         self._directory.mkdir(parents=True, exist_ok=True)

@@ -10,6 +10,7 @@ import contextlib
 import dataclasses
 import functools
 import html
+import operator
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -28,7 +29,7 @@ from ..results.reader import Collection, Value, collect, identity, read_record
 from ..results.run_directory import History
 from ..signs import Sign
 from ..tables import Layout, Style, Table, html_text, tabulate
-from ..tables.aggregate import lost_share
+from ..tables.aggregate import in_order, lost_share
 from ..tables.model import data_frame, require, significant
 from . import callbacks
 from .batching import sentence
@@ -331,12 +332,8 @@ class Runs:
             key, _, direction = name.partition(":")
             self._known(key)
             larger = key in self.found.infos and self.found.infos[key].larger_is_better
-            there = [run for run in rows if run.value(key) is not None]
-            there.sort(
-                key=lambda run: _order(run.value(key)),
-                reverse=direction == "desc" or (larger and direction != "asc"),
-            )
-            rows = there + [run for run in rows if run.value(key) is None]
+            descending = direction == "desc" or (larger and direction != "asc")
+            rows = in_order(rows, operator.methodcaller("value", key), descending=descending)
         return self._with(rows)
 
     def filter(self, *conditions: str | Callable[[Run], bool]) -> Runs:
@@ -416,11 +413,6 @@ class Runs:
 
     def _known(self, key: str) -> None:
         choice("Runs", "name", key, (*self.found.metrics, *self.found.keys))
-
-
-def _order(value: Value) -> tuple[bool, float, str]:
-    number = isinstance(value, int | float)
-    return (False, float(value), "") if number else (True, 0.0, str(value))  # type: ignore[arg-type]
 
 
 def _hashable(value: Value) -> Value:

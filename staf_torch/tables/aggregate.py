@@ -9,6 +9,7 @@ import math
 import statistics
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TypeVar
 
 from ..numerics import TABLE_COMMAND, fail
 from ..results.files import COMPLETED, grouped, is_number, visible
@@ -16,6 +17,7 @@ from ..results.reader import Collection, RecordedRun, Value, identity
 from ..results.run import OWN, as_text
 from .model import Column, Row, Style, Table
 
+T = TypeVar("T")
 _SERIES = 200  # degrees of freedom from which the expansion is more accurate than 1e-12
 _MOST = 6  # metrics that a table shows where none is declared a headline
 _NAMED = 3  # runs without a result that a note names
@@ -317,16 +319,20 @@ def _notes(runs: Sequence[RecordedRun]) -> Iterator[str]:
 
 
 def _sorted(table: Table, names: Sequence[str]) -> list[Row]:
-    """By columns, the first counts most; numbers before texts, what is missing last in either direction."""
+    """By columns, the first counts most."""
     rows = list(table.rows)
     for name in reversed(names):  # stable: the last sort is by the first name
         column, largest = _column(table, name.removesuffix(_ASCENDING).removesuffix(_DESCENDING))
         descending = name.endswith(_DESCENDING) or (largest and not name.endswith(_ASCENDING))
-        present = [row for row in rows if _there(row.cells.get(column))]
-        missing = [row for row in rows if not _there(row.cells.get(column))]
-        present.sort(key=lambda row: _key(row.cells[column]), reverse=descending)
-        rows = present + missing
+        rows = in_order(rows, lambda row: row.cells.get(column), descending=descending)  # noqa: B023 (at once)
     return rows
+
+
+def in_order(items: Sequence[T], value: Callable[[T], Value], *, descending: bool) -> list[T]:
+    """Return items by a value: numbers before texts, what is missing last in either direction."""
+    present = [item for item in items if _there(value(item))]
+    present.sort(key=lambda item: _key(value(item)), reverse=descending)
+    return present + [item for item in items if not _there(value(item))]
 
 
 def _column(table: Table, name: str) -> tuple[str, bool]:

@@ -268,14 +268,13 @@ def _write_room(folder: Path, room: str) -> None:
     if source_file(f"staf_torch/{room}/README.md"):
         lines[-1] += f" The manual: [{room}](../../staf_torch/{room}/README.md)."
     lines += ["", "| name | |", "|---|---|"]
-    lines += [f"| [`{each.name}`]({each.name}.md) | {_cell(each.summary)} |" for each in names]
+    cells = [each.summary.replace("|", "\\|") for each in names]
+    lines += [
+        f"| [`{each.name}`]({each.name}.md) | {cell} |" for each, cell in zip(names, cells, strict=True)
+    ]
     _write(folder / room / "index.md", "\n".join(lines) + "\n")
     for each in names:
         _write(folder / room / f"{each.name}.md", _page(room, each))
-
-
-def _cell(summary: str) -> str:
-    return summary.replace("|", "\\|")
 
 
 def _page(room: str, name: Name) -> str:

@@ -66,4 +66,8 @@ class BatchedLauncher(launcher.Launcher):
         """Run the jobs and return Hydra's records of them (`JobReturn`), in order."""
         from staf_torch.sweeps.launcher import Launch
 
-        return Launch(self).run(job_overrides, initial_job_idx)
+        launch = Launch(self)
+        if launch.in_table:
+            launch.fill_table(job_overrides)
+            return ()
+        return launch.fill_directories(job_overrides, initial_job_idx)
