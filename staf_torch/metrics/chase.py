@@ -45,8 +45,8 @@ class ChaseMetrics:
     not diverge; None where there is no such time or trajectory. `results.run.MEANINGS` says what each is;
     `certificate_violations` is there only where certificates were made.
 
-    Where the batch holds several ``members``, problems with a dt and settle_time of their own, `summaries`
-    has one dictionary each. ``own`` are metrics of the user's own, reported beside these under their names;
+    A batch holds ``members``, problems with a dt and settle_time of their own, and `summaries` has a
+    dictionary of each. ``own`` are metrics of the user's own, reported beside these under their names;
     ``errors`` finds the errors on a ball, where several chases along the same states share one.
     """
 
@@ -57,16 +57,15 @@ class ChaseMetrics:
         law: UpdateLaw,
         *,
         inner_steps: int,
-        dt: float = 1.0,
-        settle_time: float = 0.0,
-        members: Sequence[Member] | None = None,
+        members: Sequence[Member],
         own: Sequence[Metric] = (),
         errors: StateErrorPass | None = None,
     ) -> None:
         self._basis, self._target, self._law = basis, target, law
         self._inner_steps = inner_steps
-        self._whole = Member(0, dt, settle_time)
         self._members = members
+        self._sizes = torch.tensor([each.rows for each in members], dtype=torch.int64, device="cpu")
+        self._first = torch.tensor([each.first for each in members], dtype=torch.int64, device="cpu")
         self._own = tuple(own)
         self._errors = StateErrorPass(basis, target) if errors is None else errors
         self._rows = _RowRecord(0)
@@ -74,10 +73,9 @@ class ChaseMetrics:
 
     def next_rows(self) -> None:
         """Say that the next pieces begin at time 0 again, with further rows of the batch."""
-        assert self._members is not None
         if self._kept is None:
             self._kept = _RowRecord(0)
-        self._kept.fill(self._rows.finished(), sum(member.rows for member in self._members))
+        self._kept.fill(self._rows.finished(), int(self._sizes.sum()))
         self._rows = _RowRecord(self._rows.first + len(self._rows.diverged))
 
     def add(self, result: ChaseResult) -> None:
@@ -124,41 +122,11 @@ class ChaseMetrics:
         if result.certificate is not None:
             rows.count("certificate_violations", result.certificate.violated[:, at] & settled)
 
-    def summary(self) -> dict[str, float | None]:
-        """Name to number over all rows; None where there is nothing to report."""
-        found = self._gathered()
-        (only,) = self._summaries([self._whole._replace(rows=len(found.diverged))], found)
-        return only
-
     def summaries(self) -> list[dict[str, float | None]]:
-        """Name to number over the rows of each member, in the order of the members."""
-        assert self._members is not None
-        return self._summaries(self._members, self._gathered())
-
-    def _firsts(self, start: int, batch: int) -> Tensor:
-        """The index of the first settled time of each of the rows from ``start`` on: (B,)."""
-        if self._members is None:
-            return torch.full((batch,), self._whole.first, dtype=torch.int64, device="cpu")
-        ends = torch.tensor(
-            [member.rows for member in self._members], dtype=torch.int64, device="cpu"
-        ).cumsum(0)
-        of_row = torch.searchsorted(ends, torch.arange(start, start + batch, device="cpu"), right=True)
-        return torch.tensor([member.first for member in self._members], dtype=torch.int64, device="cpu")[
-            of_row
-        ]
-
-    def _gathered(self) -> _RowRecord:
-        """All rows as one."""
-        last = self._rows.finished()
-        if self._kept is None:
-            return last
-        self._kept.fill(last, len(self._kept.diverged))
-        return self._kept
-
-    def _summaries(self, members: Sequence[Member], found: _RowRecord) -> list[dict[str, float | None]]:
-        """Name to number over the next rows of each member."""
-        sizes = torch.tensor([member.rows for member in members], dtype=torch.int64, device="cpu")
-        whose = torch.arange(len(members), device="cpu").repeat_interleave(sizes).to(found.diverged.device)
+        """Name to number over the rows of each member, in order; None where there is nothing to report."""
+        found, members = self._gathered(), self._members
+        whose = torch.arange(len(members), device="cpu").repeat_interleave(self._sizes)
+        whose = whose.to(found.diverged.device)
         kept = ~found.diverged
 
         def of_each(quantity: Tensor, none: float, how: str) -> list[float]:
@@ -184,6 +152,19 @@ class ChaseMetrics:
             )
             for i, member in enumerate(members)
         ]
+
+    def _firsts(self, start: int, batch: int) -> Tensor:
+        """The index of the first settled time of each of the rows from ``start`` on: (B,)."""
+        rows = torch.arange(start, start + batch, device="cpu")
+        return self._first[torch.searchsorted(self._sizes.cumsum(0), rows, right=True)]
+
+    def _gathered(self) -> _RowRecord:
+        """All rows as one."""
+        last = self._rows.finished()
+        if self._kept is None:
+            return last
+        self._kept.fill(last, len(self._kept.diverged))
+        return self._kept
 
     def _summary(
         self,

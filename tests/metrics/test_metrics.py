@@ -17,7 +17,7 @@ from staf_torch.approximation.conditioning import sup_error
 from staf_torch.engine import ChaseResult, chase_pieces
 from staf_torch.metrics import Metric
 from staf_torch.metrics.ball_error import StateErrorPass
-from staf_torch.metrics.chase import ChaseMetrics
+from staf_torch.metrics.chase import ChaseMetrics, Member
 from staf_torch.numerics.linalg import condition_number
 from staf_torch.optim import SteepestDescent
 from staf_torch.targets import Paper
@@ -50,11 +50,13 @@ def gather(
     at: torch.Tensor, settle_time: float = 2.0, piece: int | None = None, kernel: str = "exponential"
 ) -> tuple[dict[str, float | None], ChaseResult]:
     basis, law = basis_of(kernel, 3), SteepestDescent()
-    metrics = ChaseMetrics(basis, Paper(), law, inner_steps=10, dt=DT, settle_time=settle_time)
+    members = [Member(len(at), DT, settle_time)]
+    metrics = ChaseMetrics(basis, Paper(), law, inner_steps=10, members=members)
     parts = at.split(at.shape[1] if piece is None else piece, dim=1)
     for result in chase_pieces(parts, basis, Paper(), law, inner_steps=10):
         metrics.add(result)
-    return metrics.summary(), st.chase(at, basis, Paper(), law, inner_steps=10)
+    (found,) = metrics.summaries()
+    return found, st.chase(at, basis, Paper(), law, inner_steps=10)
 
 
 @over(("exponential", "matern52", "polynomial"))

@@ -177,9 +177,9 @@ def test_a_window_begins_at_the_first_time_that_is_not_before_it(
 @pytest.mark.parametrize(("settle", "ends"), [(11.0, True), (12.0, False), (40.0, False)])
 def test_of_a_window_after_the_end_there_is_nothing(settle: float, ends: bool) -> None:
     whole = result(True, ())
-    metrics = metrics_of(Law(), settle_time=settle)
+    metrics = metrics_of(Law(), members=[Member(len(whole.state), 1.0, settle)])
     metrics.add(whole)
-    found = metrics.summary()
+    (found,) = metrics.summaries()
     assert ("certificate_violations" in found) is ends
     assert (found["ultimate_error"] is not None) is ends
     assert (found["settling_time"] is not None) is ends

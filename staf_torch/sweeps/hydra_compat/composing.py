@@ -50,7 +50,7 @@ def take_directory(taken: dict[str, str], directory: Path, job: str) -> None:
         )
 
 
-def parse_override(line: str, loader: ConfigLoader | None = None) -> Override:
+def parse_override(line: str) -> Override:
     """Return one override, parsed by Hydra's grammar.
 
     Raises:
@@ -58,7 +58,7 @@ def parse_override(line: str, loader: ConfigLoader | None = None) -> Override:
         ValueError: if its brackets are nested too deep.
     """
     try:
-        (parsed,) = OverridesParser.create(config_loader=loader).parse_overrides([line])
+        (parsed,) = OverridesParser.create().parse_overrides([line])
     except RecursionError as error:
         raise ValueError(f"{line[:40]}... is nested too deep.") from error
     return parsed
