@@ -76,8 +76,8 @@ class Prepared:
     def planned(self, leaves: Sequence[Any]) -> Plan | None:
         """Return the plan of the compiled call, made now if there is none; None where the definition runs.
 
-        Args:
-            leaves: of the row, of the times and of the carry, of the forms that the call is prepared for.
+        Leaves are those of the row, of the times and of the carry, of the forms that the call is prepared
+        for.
         """
         where = ordinary(leaves)
         if self.plan is None and where and not self._refused:

@@ -220,14 +220,11 @@ def columns(numbers: Sequence[RowNumbers], count: int | None) -> list[Tensor]:
 
 
 def over_rows(function: Callable[..., Some], *given: Tree) -> Some:
-    """function(*given), trees (B, ...) to (B, ...), where the function may read numbers of a row's own.
+    """function(*given), trees (B, ...) to (B, ...) or of `Shared` tensors, where the function may read
+    numbers of a row's own, and no row sees another.
 
     It runs once with all rows where it meets none. Else it runs under `torch.func.vmap`, each row with its
     own numbers and a batch of one; row by row where it decides by values.
-
-    Args:
-        function: of which no row sees another.
-        given: trees of tensors (B, ...), and `Shared` ones.
     """
     if not RowNumbers.made or (getattr(_active, "resolve", None) is not None and not _tried()):
         return function(*given)  # there are none, or somebody outside has said whose

@@ -56,12 +56,9 @@ class SharedPrograms:
         self._latest: dict[Hashable, tuple[Program, Contents | None, tuple[Any, ...]]] = {}
 
     def unchanged(self, *owners: Any) -> Program | None:
-        """Return the program that `of` last returned for these very objects, if they are as they were.
+        """Return the program that `of` last returned for these very owners, if they are as they were.
 
         A fiftieth of the time of `of`, which reads all of them again.
-
-        Args:
-            owners: as given to `of`.
         """
         program, read, _ = self._latest.get(_identities(owners), (None, None, None))
         if read is None or read.reason is not None or not read.unchanged():

@@ -29,17 +29,11 @@ Form = int | torch.device
 
 
 class Built(NamedTuple):
-    """The record of a program that was built.
-
-    Args:
-        compiled: the program.
-        trace: from which it was made.
-        followed: whether the trace is of the program that this one follows.
-    """
+    """The record of a program that was built."""
 
     compiled: Compiled
-    trace: Trace
-    followed: bool = False
+    trace: Trace  # from which it was made
+    followed: bool = False  # whether the trace is of the program that this one follows
 
     @classmethod
     def of(cls, made: Trace, call: Any, given: Given) -> Built:

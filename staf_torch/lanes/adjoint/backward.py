@@ -44,20 +44,15 @@ class _Sum(NamedTuple):
 class _Adjoint(NamedTuple):
     """Facts on the adjoint of a program that do not depend on the numbers of its tensors.
 
-    Args:
-        trace: of the program that keeps carries, by which it is known.
-        form: which gradients there are.
-        table: by which those of captured tensors follow from those of numbers of the table; None where the
-            adjoint has them itself.
-        sums: over times.
-        structures: of the adjoint's inputs.
+    By the table gradients of captured tensors follow from those of its numbers; it is None where the adjoint
+    has them itself.
     """
 
-    trace: Any
-    form: Differentiated
+    trace: Any  # of the program that keeps carries, by which it is known
+    form: Differentiated  # which gradients there are
     table: TableSlopes | None
-    sums: list[_Sum]
-    structures: dict[str, Any]
+    sums: list[_Sum]  # over times
+    structures: dict[str, Any]  # of the adjoint's inputs
 
     @property
     def kind(self) -> Hashable:
@@ -205,11 +200,8 @@ class Backward:
         return adjoint_step(program.step, self._call.structures, self._adjoint.form, found, numbers)
 
     def run(self, kept: Sequence[Tensor]) -> list[Tensor | None]:
-        """Return the gradients by all tensors.
-
-        Args:
-            kept: the carry before every time, if the forward pass has kept it.
-        """
+        """Return the gradients by all tensors, with the carry before every time if the forward pass has
+        ``kept`` it."""
         if not self._needed.issubset(self._ran.keeps or ()):
             kept = []
         assert self.built is not None

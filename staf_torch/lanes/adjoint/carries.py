@@ -27,11 +27,7 @@ of the time before, in the carry alone."""
 def carried(
     graph: Graph, layout: Sizes, following: Sequence[int], outputs: Sequence[int]
 ) -> tuple[tuple[str, int], ...]:
-    """Return where the numbers of each leaf of the carry are, and in which output.
-
-    Args:
-        graph, layout, following, outputs: of a traced program.
-    """
+    """Return where the numbers of each leaf of the carry of a traced program are, and in which output."""
     made = parts(outputs, layout.outputs)
     found = []
     for k, after in enumerate(parts(following, layout.carries)):
@@ -50,12 +46,7 @@ def carried(
 
 
 def parts(nodes: Sequence[int], sizes: Sequence[int]) -> list[list[int]]:
-    """Return the nodes of each leaf.
-
-    Args:
-        nodes: of all leaves.
-        sizes: entries of each.
-    """
+    """Return the nodes of each leaf, of those of all leaves and the ``sizes`` of each, in entries."""
     ends = itertools.accumulate(sizes, initial=0)
     return [[*nodes[a:b]] for a, b in itertools.pairwise(ends)]
 
@@ -67,19 +58,12 @@ def in_results(trace: Trace, results: int) -> frozenset[int]:
 
 
 class Rooms(NamedTuple):
-    """Tensors of a forward pass, of the dtype of its program.
+    """Tensors of a forward pass, of the dtype of its program."""
 
-    Args:
-        all: that are written to; without memory where a carry is not wanted.
-        results: those that are returned: the carry after the last time, and the results.
-        before: the carry before every time, once they are written; of no meaning for leaves not kept.
-        watched: results that are part of it, without their memory, with the writes that torch has counted.
-    """
-
-    all: list[Tensor]
-    results: list[Tensor]
-    before: list[Tensor]
-    watched: list[Watched]
+    all: list[Tensor]  # that are written to; without memory where a carry is not wanted
+    results: list[Tensor]  # those that are returned: the carry after the last time, and the results
+    before: list[Tensor]  # the carry before every time, once written; of no meaning for leaves not kept
+    watched: list[Watched]  # results that are part of it, without memory, and the writes torch has counted
 
 
 class Keeping:
@@ -124,11 +108,7 @@ class Keeping:
                 self._before.append((j, *rows_innermost(rows, (times,), shape)))
 
     def __call__(self, carry: Sequence[Tensor]) -> Rooms:
-        """Return new tensors for a call.
-
-        Args:
-            carry: before the first time.
-        """
+        """Return new tensors for a call with this carry before the first time."""
         like, memory, made = self._like, dict[int, Tensor](), dict[int, Tensor]()
         for j, (size, *form) in self._made.items():
             memory[j] = fresh(like, size)

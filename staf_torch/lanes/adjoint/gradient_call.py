@@ -74,35 +74,20 @@ def gradient_memory(mebibytes: float) -> Iterator[None]:
 
 
 class Ran(NamedTuple):
-    """Facts of one call that its backward pass needs beside the tensors.
+    """Facts of one call that its backward pass needs beside the tensors."""
 
-    Args:
-        call: that was made.
-        where: its tensors are.
-        built: of the program that keeps carries.
-        order: what the step reads, in an order that all processes share.
-        found: places of the captured tensors with a gradient among those that the trace found.
-        captured: these tensors.
-        read: all that the trace found.
-        numbers: of rows that the step reads.
-        versions: of what the step reads and has no gradient.
-        keeps: leaves of the carry that are kept, or that results have; None where nothing is kept.
-        written: those of them that no result has; None where nobody asks for a gradient.
-        budget: bytes.
-    """
-
-    call: GradientCall
-    where: Where
-    built: Built
-    order: dict[int, int]
-    found: tuple[int, ...]
-    captured: tuple[Tensor, ...]
-    read: tuple[Tensor, ...]
-    numbers: tuple[RowNumbers, ...]
-    versions: tuple[tuple[Tensor, int], ...]
-    keeps: frozenset[int] | None
-    written: frozenset[int] | None
-    budget: int
+    call: GradientCall  # that was made
+    where: Where  # its tensors are
+    built: Built  # of the program that keeps carries
+    order: dict[int, int]  # what the step reads, in an order that all processes share
+    found: tuple[int, ...]  # places of the captured tensors with a gradient among those that the trace found
+    captured: tuple[Tensor, ...]  # these tensors
+    read: tuple[Tensor, ...]  # all that the trace found
+    numbers: tuple[RowNumbers, ...]  # of rows that the step reads
+    versions: tuple[tuple[Tensor, int], ...]  # of what the step reads and has no gradient
+    keeps: frozenset[int] | None  # leaves of the carry that are kept, or that results have; None: nothing is
+    written: frozenset[int] | None  # those of them that no result has; None where nobody asks for a gradient
+    budget: int  # bytes
 
 
 class GradientCall:
@@ -137,8 +122,7 @@ class GradientCall:
     def __call__(self, leaves: Sequence[Any]) -> tuple[Any, Any] | None:
         """Return the carry and the outputs, None where the definition must compute them.
 
-        Args:
-            leaves: what a row has once, what times bring, the carry.
+        Leaves are what a row has once, what times bring, and the carry.
         """
         if self._refused or not self.program.compile:
             return None

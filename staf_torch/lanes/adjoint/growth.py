@@ -25,14 +25,10 @@ class Slope(NamedTuple):
 
 
 def grown(program: str, ends: Sequence[Tensor], found: Sequence[Tensor]) -> bool:
-    """Return whether gradients are beyond all proportion, and nobody has said so of the program.
+    """Return whether gradients that are made from ``ends``, (B, ...), are beyond all proportion, and nobody
+    has said so of the program of that name.
 
     On a device, and in `torch.func`, nobody looks: a number would have to be waited for.
-
-    Args:
-        program: its name.
-        ends: what the gradients are made from, (B, ...).
-        found: the gradients.
     """
     wrapped = torch._C._functorch.is_functorch_wrapped_tensor
     if program in _said or not ends or any(x.is_meta or not x.is_cpu or wrapped(x) for x in (*ends, *found)):
@@ -51,10 +47,7 @@ def grown(program: str, ends: Sequence[Tensor], found: Sequence[Tensor]) -> bool
 def say_grown(program: str, ends: Sequence[Tensor], slopes: Sequence[Slope]) -> None:
     """Log, once a program, the first row whose gradient is beyond all proportion, and by what.
 
-    Args:
-        program: its name.
-        ends: what the gradients are made from, (B, ...).
-        slopes: the gradients.
+    Proportion is to the ``ends``, (B, ...), that gradients are made from.
     """
     came = torch.stack([_by_row(end, 1) for end in ends]).nansum(0)
     rows = [(name, _by_row(value, math.inf)) for name, value, by_row in slopes if by_row and value.numel()]

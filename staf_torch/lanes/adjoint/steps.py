@@ -134,15 +134,10 @@ class ReversedStep:
 
 
 class Deciding(NamedTuple):
-    """Facts that an adjoint depends on.
+    """Facts that an adjoint depends on."""
 
-    Args:
-        carry: which leaves of the carry decide, now or later, what has a gradient: all goes through them.
-        usual: whether what makes it of a row are operations of which `trace.reverse` has torch's derivative.
-    """
-
-    carry: tuple[bool, ...]
-    usual: bool
+    carry: tuple[bool, ...]  # leaves that decide, now or later, what has a gradient: all goes through them
+    usual: bool  # whether it is made of a row by operations of which `reverse` has torch's derivative
 
 
 def deciding(

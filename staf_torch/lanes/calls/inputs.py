@@ -24,11 +24,8 @@ def readable(x: Any, recorded: bool) -> bool:
     """Return whether compiled code may read a tensor where it lies, wherever that is.
 
     The one rule of all that is given to compiled code, samples of streams, too: a tensor of no subclass,
-    without a pending sign, of which nobody wants a derivative. Device, dtype and layout are the caller's.
-
-    Args:
-        x: the tensor, or anything.
-        recorded: whether one that requires a gradient is refused.
+    without a pending sign, of which nobody wants a derivative: one that requires a gradient is refused where
+    that is ``recorded``. Device, dtype and layout are the caller's.
     """
     return type(x) in _TENSORS and not (recorded and x.requires_grad) and not x.is_neg()
 

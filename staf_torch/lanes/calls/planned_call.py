@@ -34,16 +34,12 @@ _MANY = 2**20  # rows times steps of a call that may take long
 
 
 def fresh(like: Tensor, *shape: int) -> Tensor:
-    """Return an empty tensor.
+    """Return an empty tensor of a shape, of the dtype and device of another.
 
     A first write to ordinary pages costs more than the recursion that writes to them (4.8 megabytes took 3.2
     ms, of huge pages .6). The system gives huge ones, if it does, only to memory that begins where such a
     page may begin, and `malloc` does not: large tensors are mappings of their own, given back when the tensor
     goes.
-
-    Args:
-        like: dtype and device.
-        shape: of the tensor.
     """
     size = torch.Size(shape).numel() * like.element_size()
     if like.device.type != "cpu" or size < LARGE or not hasattr(mmap, "MADV_HUGEPAGE"):
@@ -161,13 +157,11 @@ class PlannedCall:
         self._reference = ctypes.addressof(self._call)
 
     def makes(self, leaves: Sequence[Any], to: Sequence[int]) -> Any:
-        """Return what lets this program make inputs of times of another, a few rows at a time.
+        """Return what lets this program make inputs of times of another, a few rows at a time, from its own
+        ``leaves``, of which every time is recorded.
 
-        The other one reads them from the last time to the first.
-
-        Args:
-            leaves: inputs of this one, of which every time is recorded.
-            to: of each of its results, the carry before the outputs: which input of a time, or -1.
+        The other one reads them from the last time to the first: ``to`` says of each result, the carry before
+        the outputs, which input of a time it is, or -1.
         """
         given = self._as_read(leaves)
         packed = ctypes.c_char_p(self._packed(*map(_address, given), *[0] * len(to)))
@@ -198,11 +192,8 @@ class PlannedCall:
         return late
 
     def __call__(self, leaves: Sequence[Any]) -> list[Tensor]:
-        """Return the carry after the last step and the outputs, all new.
-
-        Args:
-            leaves: inputs of the forms that the examples had.
-        """
+        """Return the carry after the last step and the outputs, all new, of inputs of the forms that the
+        examples had."""
         if self.simple:
             rooms = [*map(_empty_like, self._likes)]
             addresses = self._packed(*map(_address, leaves), *map(_address, rooms))
@@ -218,13 +209,8 @@ class PlannedCall:
         return rooms
 
     def into(self, rooms: Sequence[Tensor], leaves: Sequence[Any], again: Any = None) -> None:
-        """Write the carry after the last step and the outputs into tensors of the program's dtype.
-
-        Args:
-            rooms: as the examples, or as a call makes them.
-            leaves: inputs of the forms that the examples had.
-            again: what makes some of them, of `makes`.
-        """
+        """Write the carry after the last step and the outputs into tensors of the program's dtype, which
+        are as the examples were or as a call makes them. ``again`` makes some of the inputs, of `makes`."""
         given, reference = self._as_read(leaves), self._reference
         if again is not None:
             call = _CallRecord.from_buffer_copy(self._call)  # another thread may be at this one
@@ -254,12 +240,9 @@ class PlannedCall:
         return [*leaves[: self._once], *columns(self._compiled.rows, self._rows), *leaves[self._once :]]
 
     def of_states(self, *lead: int) -> Callable[..., Tensor] | None:
-        """Return the function of the inputs to the only output of one time, (*lead, ...); None if that is
-        more than a call of machine code.
-
-        Args:
-            lead: the rows of the output, or nothing for a single row without that dimension.
-        """
+        """Return the function of the inputs to the only output of one time, (*lead, ...), where ``lead``
+        are the rows, or nothing for a single row without that dimension; None if that is more than a call
+        of machine code."""
         if not self.simple or len(self._rooms) != 1:
             return None
         size, _ = self._compiled.outputs[0]

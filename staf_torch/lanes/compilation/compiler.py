@@ -70,10 +70,7 @@ def compiled(source: Path, *definitions: str) -> Callable[..., None] | None:
 
 
 def machine_code(text: str) -> Callable[..., None]:
-    """Return the entry ``lanes_run`` of a program.
-
-    Args:
-        text: C++, of `cpp.emit`.
+    """Return the entry ``lanes_run`` of a program's C++, of `cpp.emit`.
 
     Raises:
         OSError: if there is no compiler, or it refuses the text.

@@ -134,11 +134,8 @@ class Contents:
             _log.warning("%s: later changes of what it reads here are not noticed: %s", name, self.reason)
 
     def unchanged(self, *, library: bool = True) -> bool:
-        """Return whether nothing of what can be watched has changed since.
-
-        Args:
-            library: whether to look for replaced methods of classes that are not a user's, too.
-        """
+        """Return whether nothing of what can be watched has changed since; with ``library`` also no method
+        of a class that is not a user's."""
         try:
             return (
                 torch.get_default_dtype() is self._default

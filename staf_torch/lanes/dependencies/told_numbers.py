@@ -28,13 +28,8 @@ def told_copies(told: Told, parts: tuple[Any, ...]) -> tuple[Any, ...]:
 
 
 def leads_by_copies(read: Contents, parts: tuple[Any, ...]) -> bool:
-    """Return whether all that leads to told floats is copied. A closure or an object of a user's is not: a
-    trace would read the float there.
-
-    Args:
-        read: contents of the parts, telling.
-        parts: objects that a step reads.
-    """
+    """Return whether all that leads from a step's parts to told floats, of contents that tell, is copied.
+    A closure or an object of a user's is not: a trace would read the float there."""
     copies = _Copies(read.told)
     copies.all(parts)
     beside = Contents(*copies.others, telling=True)

@@ -46,17 +46,11 @@ _IN_ORDER = 3
 
 
 class RowC(NamedTuple):
-    """A step of a single row, traced for C.
-
-    Args:
-        traced: the program.
-        given: inputs, of which the first row's carry is that of the start.
-        table: its numbers; none where they are part of the text.
-    """
+    """A step of a single row, traced for C."""
 
     traced: Traced
-    given: Given
-    table: CTable
+    given: Given  # of which the first row's carry is that of the start
+    table: CTable  # its numbers; none where they are part of the text
 
     @classmethod
     def of(
@@ -139,12 +133,8 @@ def sources(recipe: Recipe) -> dict[int, frozenset[int]]:
 
 
 def kept(recipe: Recipe, real: torch.dtype) -> list[Tensor]:
-    """Return the found tensors of which all that follows is exact arithmetic of few numbers.
-
-    Args:
-        recipe: of a table.
-        real: dtype of the program.
-    """
+    """Return the found tensors of a table's recipe of which all that follows is exact arithmetic of few
+    numbers, in the program's dtype."""
     if not recipe.repeats:
         return []
     known, read, folded = sources(recipe), set[int](), set[int]()
@@ -186,8 +176,7 @@ def _small(parts: Sequence[Tensor], real: torch.dtype) -> bool:
 def named_tensors(roots: Mapping[str, Any]) -> dict[int, tuple[str, Tensor]]:
     """Return tensors that objects lead to by the addresses of their memory, with the shortest name of each.
 
-    Args:
-        roots: objects by their names; that of the only one may be "".
+    The name of an only object may be "".
     """
     found: dict[int, tuple[str, Tensor]] = {}
     met, waiting = set[int](), [*roots.items()]

@@ -104,12 +104,8 @@ def at_once(function: Callable[[], Some], count: int, rows: Tensor) -> list[Alik
 
 
 def decided(function: Callable[[], Any], most: int | None = None) -> None:
-    """Call function() for rows with numbers of their own; once where it reads none.
-
-    Args:
-        function: of no arguments, a check.
-        most: rows, spread over all of them; all by default.
-    """
+    """Call function(), a check without arguments, for rows with numbers of their own, ``most`` of them at
+    most, spread over all; once where it reads none."""
     count = tried(function)[1]
     if count is not None:
         at_once(function, count, spread_rows(count, most))
@@ -128,12 +124,8 @@ class NumbersOfRows(NamedTuple):
 
 
 def numbers_of_rows(function: Callable[[], tuple[Tensor, ...]], most: int | None = None) -> NumbersOfRows:
-    """Return what a function returns for rows with numbers of their own; for one row where it reads none.
-
-    Args:
-        function: of no arguments, to tensors.
-        most: rows, spread over all of them; all by default.
-    """
+    """Return the tensors that function() returns for rows with numbers of their own, ``most`` of them at
+    most, spread over all; for one row where it reads none."""
     single, count = tried(function)
     if count is None:
         assert single is not None
@@ -261,12 +253,8 @@ def _agreed(values: Tensor) -> bool:
 
 
 def _values(tensor: Any, level: int | None = None) -> Tensor | None:
-    """Return the values of a tensor in all rows, (R, ...); None where they are one for all rows.
-
-    Args:
-        tensor: or anything else.
-        level: of the `vmap` over the rows; None for any.
-    """
+    """Return the values of a tensor in all rows, (R, ...), of the `vmap` over the rows of a level, or of
+    any; None where they are one for all rows, and of anything else."""
     if not isinstance(tensor, Tensor) or isinstance(tensor, RowNumbers):
         return None
     batched, plain = False, tensor

@@ -19,10 +19,7 @@ _active = threading.local()
 
 def tried(function: Callable[[], Some]) -> tuple[Some | None, int | None]:
     """Return function(), and how many rows the numbers have that it read: with None it read none of rows.
-
-    Args:
-        function: of no arguments; it is left where it reads a number of rows.
-    """
+    It is left where it reads the first."""
     if not in_use():
         return function(), None
     try:
@@ -36,12 +33,8 @@ def tried(function: Callable[[], Some]) -> tuple[Some | None, int | None]:
 
 
 def each_row(function: Callable[[], Some], most: int | None = None) -> list[Some]:
-    """function() of every row, which sees its own numbers alone; once where it reads no numbers of rows.
-
-    Args:
-        function: of no arguments.
-        most: rows, spread over all of them; all by default.
-    """
+    """function() of every row, or of ``most`` spread over all, which sees its own numbers alone; once
+    where it reads no numbers of rows."""
     found, count = tried(function)
     if count is None:
         return [found]  # type: ignore[list-item]

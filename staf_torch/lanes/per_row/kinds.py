@@ -30,13 +30,8 @@ class Kind(NamedTuple):
 
 
 def kinds_of_rows(objects: Sequence[Any], rows: Sequence[Tensor], count: int) -> list[Kind]:
-    """Return objects merged where they are alike in all but numbers.
-
-    Args:
-        objects: of one class.
-        rows: of each, (R,).
-        count: B.
-    """
+    """Return objects of one class, each of rows (R,) of ``count``, merged where they are alike in all but
+    numbers."""
     groups = list[tuple[list[Any], list[Tensor], Any]]()
     for one, part in sorted(zip(objects, rows, strict=True), key=lambda pair: int(pair[1][0])):
         for k, (several, parts, _) in enumerate(groups):

@@ -90,13 +90,8 @@ plan._dynamo_marked_constant = True  # type: ignore[attr-defined]  # what `assum
 
 
 def taken(tree: Any, tensors: list[Tensor], objects: list[Any], *, results: bool = False) -> Any:
-    """Return the structure of a tree, of which tensors and objects are put into lists.
-
-    Args:
-        tree: nested containers.
-        tensors, objects: the lists.
-        results: whether dataclasses are containers, too.
-    """
+    """Return the structure of nested containers, of which tensors and objects are put into lists; of
+    results dataclasses are containers, too."""
     if isinstance(tree, Tensor):
         tensors.append(tree)
         return "tensor"

@@ -91,12 +91,8 @@ class TableSlopes:
         self._operations = [*reversed(kept)]
 
     def __call__(self, others: Sequence[Tensor], by_numbers: Sequence[Tensor]) -> list[Tensor]:
-        """Return the slopes.
-
-        Args:
-            others: what stands in place of all that were found.
-            by_numbers: slopes, run by run.
-        """
+        """Return the slopes, with others in place of all tensors that were found, of those by the numbers,
+        run by run."""
         known = {id(found): each.detach() for found, each in zip(self._found, others, strict=True)}
         with torch.enable_grad():
             wanted = [known[id(tensor)].requires_grad_() for tensor in self._of]

@@ -106,12 +106,8 @@ def _by_numpy(seed: Tensor, step: Tensor, count: int) -> Tensor:
 
 
 def _numbers(halves: Sequence[Tensor], block: Tensor, second: bool) -> Tensor:
-    """The first or second number of a block: key (a, b), (c, d), counter (low, high), block, 0, 0.
-
-    Args:
-        halves: a, b, c, d, low, high, each below 2^16.
-        block, second: which number.
-    """
+    """The first or second number of a block: key (a, b), (c, d), counter (low, high), block, 0, 0, of
+    halves a, b, c, d, low, high, each below 2^16."""
     low, place = halves[4], block.long()
     *key, step = (
         one.long() + (other.long() << 16) for one, other in zip(halves[::2], halves[1::2], strict=True)

@@ -36,13 +36,9 @@ _PRODUCTS = frozenset(("matmul", "__matmul__", "__rmatmul__", "mm", "bmm", "mv",
 def doubt(step: Callable[..., Any], given: Given, *, again: bool = True) -> str | None:
     """Return why a step must not be written down with a single row, None where it may.
 
-    It is called with one row, again, and with that row beside the one that differs most from it. What draws
-    random numbers, counts its calls, reads a clock or takes a mean over the batch gives itself away.
-
-    Args:
-        step: of a program.
-        given: inputs.
-        again: whether to call it twice with the same row; it has been otherwise.
+    It is called with one row, ``again`` unless it has been, and with that row beside the one that differs
+    most from it. What draws random numbers, counts its calls, reads a clock or takes a mean over the batch
+    gives itself away.
     """
     first, other = 0, _farthest(given)
     with undrawn(), torch.no_grad():

@@ -79,13 +79,9 @@ class NotLoweredError(Exception):
 
 
 def explained(error: RuntimeError, call: str) -> Exception:
-    """Return the error of who asks for numbers where there are none as a sentence that names the line of
-    code: of NumPy while torch takes derivatives, and on the meta device; another error as it is.
-
-    Args:
-        error: of torch.
-        call: the function that met it.
-    """
+    """Return the error of torch that a call met, which asks for numbers where there are none, as a
+    sentence that names the line of code: of NumPy while torch takes derivatives, and on the meta device;
+    another error as it is."""
     if re.search(r"\b([Mm]eta tensor|[Mm]eta device|device meta|register_meta)", str(error)):
         where = _where(traceback.extract_tb(error.__traceback__))
         return ValueError(
