@@ -104,8 +104,7 @@ def near_optimal(
         plant: in continuous or in discrete time.
         cost: the cost rate.
         dt: s, for which a control is held; by default the period of a plant in discrete time.
-        low: of the inputs, as in `systems.Bounds`; by default those of the cost, or else of the plant.
-        high: likewise.
+        low, high: of the inputs, as in `systems.Bounds`; by default those of the cost, or else of the plant.
         radius: of the ball of centers, in units of the state: measure states so that 1 is a large one.
         horizon: s; None for the rule above.
         plan: whether to plan all the time: ``controller()`` is a `RecedingHorizon`, and the policy as a

@@ -45,8 +45,7 @@ class Barrier(ControlAffineSystem):
 
     Args:
         plant: that says its dim, in continuous time and affine in the control.
-        low: of the states, one number or one a coordinate, in their units; None or -inf for no wall.
-        high: likewise; None or inf for none.
+        low, high: of the states, a number or one a coordinate, in their units; None or infinite for no wall.
 
     Raises:
         ValueError: if the plant is of another kind, a wall has another length or is NaN, or the plant's

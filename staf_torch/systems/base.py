@@ -38,8 +38,7 @@ class Bounds:
         Shown by `staf experiment=adp adp/cost=bounded_input adp/policy=rollout`.
 
     Args:
-        low: a number for all inputs, or one an input; None or -inf for none.
-        high: likewise; None or inf for none.
+        low, high: a number for all inputs, or one an input; None or infinite for none.
         inputs: m.
 
     Raises:

@@ -39,8 +39,7 @@ class MujocoPlant(StepPlant):
         dt: s, for which a control is held, a multiple of the model's timestep; None for one timestep.
         equilibrium: as in `StepPlant`; by default a guess at the model's `qpos0`, at rest.
         periodic: coordinates that are angles; by default the hinges without limits.
-        low: of the inputs; by default the ranges of the actuators that are limited.
-        high: likewise.
+        low, high: of the inputs; by default the ranges of the actuators that are limited.
         threads: on which the rows of a call are simulated; the result is the same for any number.
 
     Raises:

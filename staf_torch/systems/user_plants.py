@@ -111,8 +111,7 @@ class StepPlant(FunctionPlant):
         equilibrium: a guess of the state at rest, or of state and input; zeros by default. The nearest rest
             is searched: by the input alone, then by both. Where there is none the guess stays, and only what
             regulates is refused.
-        low: of the inputs, as in `Bounds`.
-        high: likewise.
+        low, high: of the inputs, as in `Bounds`.
         slopes: dx+/dx (n, n) and dx+/du (n, m) at a state (n,) and an input (m,), where a simulator knows
             them: NumPy arrays of NumPy arrays.
 

@@ -72,8 +72,7 @@ class RobustFilter(Controller):
         windows: of the integrals.
         law: of theta.
         dt: s, for which a control is held.
-        theta_low: p numbers, below which no parameter is.
-        theta_high: likewise.
+        theta_low, theta_high: p numbers, below and above which no parameter is.
         confidence: c, positive.
         decay: as in `SafetyFilter`, and so are ``degree`` and ``margin``.
 

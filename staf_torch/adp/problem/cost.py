@@ -51,8 +51,7 @@ class Cost(nn.Module, metaclass=OfRows):
         control: R, (m, m), positive definite; a number likewise.
         dim: n.
         inputs: m.
-        low: of the inputs, as in `systems.Bounds`; both None for the bounds of the plant.
-        high: likewise.
+        low, high: of the inputs, as in `systems.Bounds`; both None for the bounds of the plant.
         target: the set-point, n numbers; None for the equilibrium of the plant.
         target_input: the input there, m numbers; None for the one that holds the plant there.
         output: y(x), (..., n) -> (..., p), in place of x: e = y(x) - y(target), and Q is (p, p) or a matrix.

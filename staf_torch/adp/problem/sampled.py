@@ -56,8 +56,7 @@ class SampledProblem(nn.Module, metaclass=OfRows):
             another. It is differentiated twice by `torch.func` and compiled by `lanes`.
         dim: n.
         inputs: m.
-        low: of u, as in `systems.Bounds`; None for none.
-        high: likewise.
+        low, high: of u, as in `systems.Bounds`; None for none.
         periodic: the coordinates that are angles, in rad.
         goal: state that distances are measured from, (n,); the origin by default. Where the plant rests
             there at no cost the problem has a linear regulator; it need not.
@@ -172,8 +171,7 @@ class SampledProblem(nn.Module, metaclass=OfRows):
             plant: the plant.
             cost: the cost rate, without a discount.
             dt: s, positive; None for the period of a plant in discrete time.
-            low: of the inputs; None for those of the cost, or else of the plant.
-            high: likewise.
+            low, high: of the inputs; None for those of the cost, or else of the plant.
             substeps: Runge-Kutta steps a period; None for as many as are accurate. Fewer are a warning.
             terminal: as in `SampledProblem`; None for that of the cost, or else P.
 

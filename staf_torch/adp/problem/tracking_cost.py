@@ -44,8 +44,7 @@ class TrackingCost(QuadraticCost):
         dim: n, of the plant without its clock.
         inputs: m.
         path: x_d from t, (...) -> (..., n), in torch, with two derivatives where trajectories are optimised.
-        low: of the inputs, as in `systems.Bounds`; both None for the bounds of the plant.
-        high: likewise.
+        low, high: of the inputs, as in `systems.Bounds`; both None for the bounds of the plant.
         target_input: u_s, m numbers; None for the input that holds the plant at its equilibrium.
 
     Raises:

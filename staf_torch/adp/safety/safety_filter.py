@@ -114,8 +114,7 @@ class SafetyFilter(Controller, DecidedByRows):
         constraints: h, or a list of them, twice differentiable. h sees states (B, n) and one time as a
             tensor (), and returns (B,); it runs under `torch.func.vmap`.
         dt: s, for which a control is held; `simulate` takes it over.
-        low: of the inputs, as in `systems.Bounds`; both None for those of the plant.
-        high: likewise.
+        low, high: of the inputs, as in `systems.Bounds`; both None for those of the plant.
         decay: 1/s, one number or one a constraint: how fast h may fall. Large ones let the policy come nearer
             to the edge, and need larger controls there. At most 1/dt where the relative degree is two. None:
             1/(5 dt), or less where the relative degree is two and bounds limit the brakes: sqrt(2 a / h) at

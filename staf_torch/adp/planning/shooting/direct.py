@@ -87,8 +87,7 @@ class DirectShooting:
         terminal: V_T, (..., n) -> (...), with two derivatives, or S of e'Se, (n, n), its diagonal or a
             number; by default the cost's own terminal cost, or else the Riccati value, and where there is
             none nothing, with a warning in the log.
-        low: of the inputs, as in `systems.Bounds`; by default those of the cost, or else of the plant.
-        high: likewise.
+        low, high: of the inputs, as in `systems.Bounds`; by default those of the cost, or else of the plant.
         horizon: T in s; by default so long that the slowest mode of the LQR has fallen to 1e-4, and twice to
             eight times that where the terminal cost is more than 1e-3 of a value. With a horizon a plant
             needs no LQR, and a cost may be an economic one, with no set-point at all. Rows with numbers of
