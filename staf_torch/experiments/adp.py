@@ -31,7 +31,7 @@ from ..tables.model import significant
 from .numbers_of_jobs import RowsOfJobs, in_calls
 from .registry import BatchedExperiment, Metrics
 from .scenes import animation_kind, loop_scene, write_animation
-from .study import log_diverged, trajectories, write_history
+from .study import histories, log_diverged, trajectories, write_history
 
 _log = logging.getLogger(__name__)
 _LINEARISED = 8  # rows of a learning controller whose loop is linearised
@@ -66,6 +66,10 @@ class Regulation(BatchedExperiment[LoopSolution]):
         """Run what the settings describe and fill the run directory; `metrics.json` comes last."""
         problem = _problem(cfg)
         return self.write(cfg, directory, _solved(cfg, problem, solve(problem, progress)))
+
+    def held(self, cfg: DictConfig) -> dict[str, Tensor]:
+        """Return what a run keeps of its rows."""
+        return histories({"": solve(_problem(cfg))})
 
     def solve(self, cfgs: Sequence[DictConfig], progress: Progress) -> list[LoopSolution | Exception]:
         """Solve several configurations of one group as one tensor batch."""
@@ -195,16 +199,17 @@ def _simulated(
     """Run problems as one loop of these objects."""
     first = problems[0]
     counts = [len(problem.initial_states) for problem in problems]
-    seeds = [
-        problem.seed + row for problem, rows in zip(problems, counts, strict=True) for row in range(rows)
-    ]
+    seeds: list[int] = []
+    if len(problems) > 1:
+        for problem, rows in zip(problems, counts, strict=True):
+            seeds += range(problem.seed, problem.seed + rows)
     result = simulate(
         *objects,
         torch.cat([problem.initial_states for problem in problems]),
         dt=first.dt,
         steps=first.steps,
         every=first.every,
-        seed=seeds,
+        seed=seeds or first.seed,
         integrator=first.integrator,
         compile=first.compile,
         progress=progress,

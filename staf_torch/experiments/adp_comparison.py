@@ -26,7 +26,7 @@ from ..signs import SHOWN, Progress
 from ..tables import Table
 from .adp import learner, solve
 from .registry import Metrics
-from .study import Study, label_key
+from .study import Study, histories, label_key
 
 _log = logging.getLogger(__name__)
 _FIXED = {"extrapolated_around": "origin", "half_width": {"radius": 1.0, "offset": None}, "trust": None}
@@ -85,6 +85,14 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     return study.write(RunDirectory(directory), drawing, "adp_comparison")
 
 
+def held(cfg: DictConfig) -> dict[str, Tensor]:
+    """Return what a run keeps of the rows of every method."""
+    return histories({name: solve(variant(cfg, changes)) for name, changes in _ROWS.items()})
+
+
+run.held = held  # type: ignore[attr-defined]
+
+
 def variant(cfg: DictConfig, changes: dict[str, Any]) -> AdpProblem:
     """The closed loop of the settings with other ones under `adp`, recorded at its ends."""
     chosen = changed(cfg, changes)
@@ -135,7 +143,7 @@ def initial_weights(cfg: DictConfig, directory: Path, progress: Progress = SHOWN
     table: list[dict[str, str]] = []
     found: dict[str, list[float]] = {}
     for name, changes in _LAWS.items():
-        problem = _from_weights(variant(cfg, changes), weights, cfg.adp.actor / cfg.adp.critic)
+        problem = _from_weights(cfg, changes, weights)
         result = solve(problem, progress)
         shares = (
             regulated(result, _final(problem, result)).double().reshape(len(weights), -1).mean(-1).tolist()
@@ -157,6 +165,15 @@ def initial_weights(cfg: DictConfig, directory: Path, progress: Progress = SHOWN
     return out.metrics(metrics)
 
 
+def held_of_weights(cfg: DictConfig) -> dict[str, Tensor]:
+    """Return what a run keeps of the rows of every law."""
+    weights = _weights(cfg)
+    return histories({name: solve(_from_weights(cfg, each, weights)) for name, each in _LAWS.items()})
+
+
+initial_weights.held = held_of_weights  # type: ignore[attr-defined]
+
+
 def _weights(cfg: DictConfig) -> list[float]:
     weights = vector(COMMAND_LINE, "initial_weights", plain(cfg.initial_weights))
     if not weights:
@@ -166,8 +183,9 @@ def _weights(cfg: DictConfig) -> list[float]:
     return weights
 
 
-def _from_weights(problem: AdpProblem, weights: list[float], actor: float) -> AdpProblem:
+def _from_weights(cfg: DictConfig, changes: dict[str, Any], weights: list[float]) -> AdpProblem:
     """Every initial state once with every weight, one batch."""
+    problem, actor = variant(cfg, changes), cfg.adp.actor / cfg.adp.critic
     x0, learning = problem.initial_states, learner(problem.controller)
     assert learning is not None
     critic: Tensor = torch.tensor(weights, device="cpu").to(x0).repeat_interleave(len(x0)).unsqueeze(-1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import logging
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -25,28 +26,44 @@ from ..tables.model import significant
 from .adp import recorded
 from .registry import Metrics
 from .scenes import tracking_scene, write_animation
-from .study import Method, write_history
+from .study import Method, histories, write_history
 
 _log = logging.getLogger(__name__)
 _HORIZON, _INTERVALS = 8.0, 160  # of direct shooting: the error has fallen to 1e-5 of itself
 
 
-def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
-    """Run the three variants and fill the run directory; `metrics.json` comes last."""
+class Variants(NamedTuple):
+    """Closed loops of the tracking problem by variant, and what they share."""
+
+    plant: TwoStateTracking
+    cost: QuadraticCost
+    controllers: dict[str, Controller]
+    results: dict[str, LoopResult]
+
+
+def variants(cfg: DictConfig) -> Variants:
+    """Run the three variants."""
     device, dtype = placement(cfg.device, cfg.dtype)
-    plant = TwoStateTracking().to(device)
+    plant = TwoStateTracking()
     weights = plain(cfg.adp.cost)
-    cost = adp.tracking_cost(weights["state"], weights["control"]).to(device)
+    cost = adp.tracking_cost(weights["state"], weights["control"])
     x0 = initial_states(cfg, plant.dim).to(device=device, dtype=dtype)
     dt, steps = horizon(cfg)
     controllers = _controllers(cfg, plant, cost)
+    for part in (plant, cost, *controllers.values()):
+        part.to(device)
     shared = {"dt": dt, "steps": steps, "seed": seed_of(cfg)}
     shared |= {"integrator": cfg.adp.integrator, "compile": cfg.adp.compile}
     results = {
-        name: Method(controller.to(device), plant, cost).run(x0, **shared)
-        for name, controller in controllers.items()
+        name: Method(controller, plant, cost).run(x0, **shared) for name, controller in controllers.items()
     }
-    best = _optimal_cost(plant, cost, x0)
+    return Variants(plant, cost, controllers, results)
+
+
+def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
+    """Run the three variants and fill the run directory; `metrics.json` comes last."""
+    plant, cost, controllers, results = variants(cfg)
+    best = _optimal_cost(plant, cost, results["known"].state[:, 0])
     metrics: Metrics = {"optimal_cost": None if best is None else float(best.nanmedian())}
     for name, result in results.items():
         measured = tracking_metrics(result, result.recorded.get("theta"), plant.theta, best)
@@ -66,6 +83,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
 
 
 run.animates = True  # type: ignore[attr-defined]
+run.held = lambda cfg: histories(variants(cfg).results)  # type: ignore[attr-defined]
 
 
 def _optimal_cost(plant: TwoStateTracking, cost: QuadraticCost, x0: Tensor) -> Tensor | None:

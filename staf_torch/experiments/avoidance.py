@@ -27,7 +27,7 @@ from ..signs import SHOWN, Progress
 from ..systems import ControlAffineSystem, Linear
 from .registry import Metrics, finite
 from .scenes import animation_kind, frames, write_animation
-from .study import Method, Study, write_history
+from .study import Method, Study, histories, write_history
 
 
 class Vehicle(NamedTuple):
@@ -137,8 +137,17 @@ class AmongDiscs(ControlAffineSystem):
         return torch.stack([self.rate(x, unit.expand(*x.shape[:-1], 2)) - idle for unit in units], dim=-1)
 
 
-def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
-    """Run both methods in every scenario and fill the run directory; `metrics.json` comes last."""
+class Drives(NamedTuple):
+    """Closed loops in every scenario, with and without the filter."""
+
+    vehicle: Vehicle
+    radius: float  # m, of the discs
+    guard: SafetyFilter
+    results: dict[str, LoopResult]
+
+
+def drives(cfg: DictConfig) -> Drives:
+    """Run both methods in every scenario."""
     device, dtype = placement(cfg.device, cfg.dtype)
     chosen = cfg.avoidance
     animation_kind(cfg)  # refuses other values before anything takes time
@@ -147,8 +156,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     dt, steps = horizon(cfg)
     vehicle = chosen_vehicle(cfg, dt)
     discs = (x0.shape[-1] - vehicle.size) // 4
-    system = AmongDiscs(vehicle, discs).to(device)
-    cost = vehicle_cost(cfg, vehicle, x0.shape[-1]).to(device)
+    system, cost = AmongDiscs(vehicle, discs), vehicle_cost(cfg, vehicle, x0.shape[-1])
 
     def wanted(x: Tensor) -> Tensor:
         u: Tensor = vehicle.policy(x[..., : vehicle.size])
@@ -168,6 +176,12 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
         name: Method(each, system, cost).run(x0, dt=dt, steps=steps, compile=cfg.adp.compile)
         for name, each in ((FILTERED, guard), (BARE, Feedback(wanted)))
     }
+    return Drives(vehicle, radius, guard, results)
+
+
+def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
+    """Run both methods in every scenario and fill the run directory; `metrics.json` comes last."""
+    vehicle, radius, guard, results = drives(cfg)
     distances = {name: distance(result.state, radius, vehicle.size) for name, result in results.items()}
     study = Study("avoidance", _COLUMNS, ("cost_mean", "minimum_margin", "constraint_violations"), _log)
     for name, result in results.items():
@@ -194,6 +208,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
 
 
 run.animates = True  # type: ignore[attr-defined]
+run.held = lambda cfg: histories(drives(cfg).results)  # type: ignore[attr-defined]
 
 
 def scenarios(cfg: DictConfig) -> Tensor:

@@ -82,6 +82,12 @@ def simulate(
     return in_calls(run, objects, counts, [alike(i) for i in range(len(problems))], advance)
 
 
+def histories(problem: ChaseProblem) -> dict[str, Tensor]:
+    """Return the chase of a problem as one piece: name -> (B, T, ...)."""
+    (found,) = _chased(problem, _Objects.of(problem), problem.initial_states, problem.steps + 1)
+    return {name: x for name, x in vars(found).items() if isinstance(x, Tensor) and x.dim() > 1}
+
+
 class _Objects(NamedTuple):
     """Objects of a problem in which numbers may differ from row to row."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,10 +17,10 @@ from ..figures.closed_loop import FaultPicture, draw_faults
 from ..figures.style import draws
 from ..numerics.checks import COMMAND_LINE, choice, integer, positive_real
 from ..results.run_directory import RunDirectory
-from ..settings.chase import generator_of, plain
+from ..settings.chase import generator_of, placement, plain
 from ..signs import SHOWN, Progress
 from .registry import Metrics
-from .study import Method, Study, recorded_times
+from .study import Method, Study, histories, recorded_times
 
 _log = logging.getLogger(__name__)
 _COLUMNS = {
@@ -57,15 +57,10 @@ class FaultCase(NamedTuple):
 def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
     """Run every case with three policies and fill the run directory; `metrics.json` comes last."""
     figures = draws(cfg.figures)
-    rows = integer(COMMAND_LINE, "trajectories", cfg.trajectories, least=1)
-    duration = positive_real(COMMAND_LINE, "duration", cfg.duration)
-    generator = generator_of(cfg)
     study = Study("faults", _COLUMNS, ("cost_median", "cost_max", "regulated"), _log, digits=5)
     pictures: dict[str, FaultPicture] = {}
-    for name in plain(cfg.faults.cases):
-        choice(COMMAND_LINE, "faults.cases", name, tuple(CASES))
-        case, label = CASES[name](rows, generator), name.replace("_", " ")
-        results = {method: _run(case, control, duration) for method, control in _controllers(case).items()}
+    for name, case, results in loops(cfg):
+        label = name.replace("_", " ")
         best = case.optimum()
         for method, result in results.items():
             measured = _measured(case, result, best)
@@ -74,6 +69,30 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
             study.add(f"{name}_{method.replace(' ', '_')}_", measured, case=label, method=method)
         pictures[label] = _picture(case, results)
     return study.write(RunDirectory(directory), (lambda: draw_faults(pictures)) if figures else None)
+
+
+def loops(cfg: DictConfig) -> Iterator[tuple[str, FaultCase, dict[str, LoopResult]]]:
+    """Yield the name of every case, the case, and its three policies' closed loops."""
+    rows = integer(COMMAND_LINE, "trajectories", cfg.trajectories, least=1)
+    duration = positive_real(COMMAND_LINE, "duration", cfg.duration)
+    place, generator = placement(cfg.device, cfg.dtype), generator_of(cfg)
+    for name in plain(cfg.faults.cases):
+        choice(COMMAND_LINE, "faults.cases", name, tuple(CASES))
+        case = CASES[name](rows, generator)
+        yield (
+            *(name, case),
+            {method: _run(case, each, duration, place) for method, each in _controllers(case).items()},
+        )
+
+
+def held(cfg: DictConfig) -> dict[str, Tensor]:
+    """Return what a run keeps of the rows of every case and policy."""
+    return histories(
+        {f"{case}, {method}": one for case, _, found in loops(cfg) for method, one in found.items()}
+    )
+
+
+run.held = held  # type: ignore[attr-defined]
 
 
 def short_period(rows: int, generator: torch.Generator) -> FaultCase:
@@ -229,9 +248,11 @@ def _design(case: FaultCase) -> Tensor:
     return theta
 
 
-def _run(case: FaultCase, controller: adp.Controller, duration: float) -> LoopResult:
+def _run(
+    case: FaultCase, controller: adp.Controller, duration: float, place: tuple[torch.device, torch.dtype]
+) -> LoopResult:
     plant = adp.ChangingPlant(case.model)
-    z0 = plant.start(case.x0, case.before, case.after, case.at)
+    z0 = plant.start(case.x0, case.before, case.after, case.at).to(*place)
     times = recorded_times(duration, case.dt, _RECORDED)
     return Method(controller, plant, plant.cost(case.cost)).run(z0, dt=case.dt, **times)
 
@@ -242,7 +263,7 @@ def _measured(case: FaultCase, result: LoopResult, best: Tensor | None) -> dict[
     regulated = (norm < case.near).all(-1) & ~result.diverged
     measured = {"cost_median": float(result.cost.median()), "cost_max": float(result.cost.max())}
     if best is not None:
-        ratio = torch.where(result.diverged, torch.inf, result.cost / best)
+        ratio = torch.where(result.diverged, torch.inf, result.cost / best.to(result.cost))
         measured |= {"ratio_median": float(ratio.median()), "ratio_max": float(ratio.max())}
     return measured | {"regulated": float(regulated.double().mean())}
 
@@ -254,7 +275,8 @@ def _learned(case: FaultCase, result: LoopResult) -> dict[str, float]:
     else:
         alarmed = result["alarmed_at"][:, -1]
         found = torch.where(alarmed < 0, torch.inf, alarmed - case.at.to(alarmed))
-    error = (result["theta"][:, -1] - case.after).abs() / case.after.abs().clamp(min=1.0)
+    after = case.after.to(result.state)
+    error = (result["theta"][:, -1] - after).abs() / after.abs().clamp(min=1.0)
     return {"found_median": float(found.median()), "parameter_error": float(error.max())}
 
 
@@ -264,8 +286,8 @@ def _picture(case: FaultCase, results: dict[str, LoopResult]) -> FaultPicture:
     truth = torch.where((adaptive.time < case.at[0])[:, None], case.before[0], case.after[0])
     return FaultPicture(
         time=time,
-        norms={name: result.state[0, :, :n].norm(dim=-1).numpy() for name, result in results.items()},
-        parameters=adaptive["theta"][0].numpy(),
+        norms={name: result.state[0, :, :n].norm(dim=-1).cpu().numpy() for name, result in results.items()},
+        parameters=adaptive["theta"][0].cpu().numpy(),
         truth=truth.numpy(),
-        certain=adaptive["certain"][0].numpy() > 0,
+        certain=adaptive["certain"][0].cpu().numpy() > 0,
     )

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from omegaconf import DictConfig
+from torch import Tensor
 
 from ..figures.chase import ChaseHistory, draw_chase
 from ..figures.style import draws, images
@@ -23,7 +24,7 @@ from ..settings.plain import PlainSettings, to_read
 from ..signs import SHOWN, Progress
 from ..systems import Units
 from ..tables.model import significant
-from .chase_batch import Outcome, simulate
+from .chase_batch import HISTORY, Outcome, histories, simulate
 from .registry import BatchedExperiment, Metrics
 from .scenes import animation_kind, chase_scene, write_animation
 from .study import log_diverged, trajectories
@@ -101,6 +102,13 @@ class GradientChase(BatchedExperiment[ChaseSolution]):
                 writer.close(time=_times(title))
         starts = problem.initial_states.cpu().numpy()
         return _finish(out, ChaseSolution(title, outcome, starts, units=_units(problem)), cfg)
+
+    def held(self, cfg: DictConfig) -> dict[str, Tensor]:
+        """Return the history of a run; nothing where none is kept."""
+        problem = chase_problem(cfg)
+        _, history = _wanted(cfg, problem)
+        found = histories(problem) if history else {}
+        return {name: found[name] for name in HISTORY if history}
 
     def solve(self, cfgs: Sequence[DictConfig], progress: Progress) -> list[ChaseSolution | Exception]:
         """Solve several configurations of one group as one tensor batch."""

@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from ..adp import ConcurrentTracker, Measured, ParametricPlant, QuadraticCost
+from ..adp import ConcurrentTracker, LoopResult, Measured, ParametricPlant, QuadraticCost
 from ..figures.closed_loop import GainSets, draw_gain_sets
 from ..figures.style import draws
 from ..numerics.checks import COMMAND_LINE, fail, integer, non_negative, positive_real, real, vector
 from ..results.run_directory import RunDirectory
-from ..settings.chase import generator_of, plain, seed_of
+from ..settings.chase import generator_of, placement, plain, seed_of
 from ..signs import SHOWN, Progress
 from .registry import Metrics
-from .study import Method, Study, recorded_times
+from .study import Method, Study, histories, recorded_times
 
 _log = logging.getLogger(__name__)
 SOURCES = {"integral": "integral", "slope": "derivative"}
@@ -38,35 +36,25 @@ _COLUMNS = {
 }
 
 
-class SourceRun(NamedTuple):
-    """Closed loops of all gains with one source of the equations."""
-
-    time: Tensor  # (T,) s
-    error: Tensor  # (B, T, 2) of x
-    theta: Tensor  # (B, T, p)
-    diverged: int
-
-
 def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
     """Run both sources with the same gains and noise and fill the run directory, `metrics.json` last."""
     figures = draws(cfg.figures)
     settle = non_negative(COMMAND_LINE, "settle_time", cfg.settle_time)
-    plant, gains = published(), _gains(cfg)
-    loops = {name: _loop(cfg, plant, gains, source) for source, name in SOURCES.items()}
-    if settle > positive_real(COMMAND_LINE, "duration", cfg.duration):
-        raise fail(COMMAND_LINE, "settle_time", "must be before the end", cfg.settle_time)
-    found = {name: loop() for name, loop in loops.items()}
+    found, truth = loops(cfg), published().theta
     time = found["integral"].time
     late = time >= settle
     if not bool(late.any()):
         raise fail(COMMAND_LINE, "settle_time", "must be before the end", cfg.settle_time)
+    states = {name: each.state.cpu() for name, each in found.items()}
+    thetas = {name: each["theta"].cpu() for name, each in found.items()}
+    errors = {name: x[..., :2] - reference(x)[0] for name, x in states.items()}
     rms = {
-        "error": {name: _rms(each.error[:, late]) for name, each in found.items()},
-        "parameter_error": {name: _rms(each.theta[:, late] - plant.theta) for name, each in found.items()},
+        "error": {name: _rms(error[:, late]) for name, error in errors.items()},
+        "parameter_error": {name: _rms(theta[:, late] - truth) for name, theta in thetas.items()},
     }
     study = Study("icl", _COLUMNS, ("error_median", "parameter_error_median"), _log, digits=4)
     for name, each in found.items():
-        measured = {"diverged": float(each.diverged)}
+        measured = {"diverged": float(each.diverged.sum())}
         for what, of in rms.items():
             parts = {"median": of[name].median(), "best": of[name].min(), "worst": of[name].max()}
             measured |= {f"{what}_{key}": float(value) for key, value in parts.items()}
@@ -77,39 +65,43 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     shown = int(rms["parameter_error"]["integral"].nan_to_num(math.inf, math.inf).argmin())
     picture = GainSets(
         time=time.numpy(),
-        parameters=found["integral"].theta[shown].numpy(),
-        truth=plant.theta.numpy(),
+        parameters=thetas["integral"][shown].numpy(),
+        truth=truth.numpy(),
         error={name: values.numpy() for name, values in rms["error"].items()},
         parameter_error={name: values.numpy() for name, values in rms["parameter_error"].items()},
-        followed={name: each.error[shown].norm(dim=-1).numpy() for name, each in found.items()},
+        followed={name: error[shown].norm(dim=-1).numpy() for name, error in errors.items()},
     )
     return study.write(RunDirectory(directory), (lambda: draw_gain_sets(picture)) if figures else None)
 
 
-def _loop(
-    cfg: DictConfig, plant: ParametricPlant, gains: dict[str, Tensor], source: str
-) -> Callable[[], SourceRun]:
-    """Check the settings, and return the run of all gains with the equations of one source."""
+def loops(cfg: DictConfig) -> dict[str, LoopResult]:
+    """Run all gains with the equations of either source.
+
+    Raises:
+        ValueError: if a setting breaks its rule.
+    """
+    plant, gains = published(), _gains(cfg)
+    device, dtype = placement(cfg.device, cfg.dtype)
     dt = positive_real(COMMAND_LINE, "dt", cfg.dt)
     duration = positive_real(COMMAND_LINE, "duration", cfg.duration)
     noise = real(COMMAND_LINE, "icl.noise", cfg.icl.noise)
     size = integer(COMMAND_LINE, "icl.size", cfg.icl.size, 1)
     start = [*vector(COMMAND_LINE, "initial_state", plain(cfg.initial_state), 2), 1.0, 0.0, 1.0]
-    tracker = ConcurrentTracker(plant, reference, source=source, size=size, **gains)  # type: ignore[arg-type]
-    method = Method(
-        Measured(tracker, noise=[noise, noise, 0.0, 0.0, 0.0], dim=5),
-        plant,
-        QuadraticCost(1.0, 1.0, 5, 2, output=lambda z: z[..., :2] - reference(z)[0]),
-    )
-    x0 = torch.tensor([start], dtype=torch.float64, device="cpu").repeat(len(gains["rate"]), 1)
+    if non_negative(COMMAND_LINE, "settle_time", cfg.settle_time) > duration:
+        raise fail(COMMAND_LINE, "settle_time", "must be before the end", cfg.settle_time)
+    times = recorded_times(duration, dt, min(_RECORDED, duration / 20))
+    cost = QuadraticCost(1.0, 1.0, 5, 2, output=lambda z: z[..., :2] - reference(z)[0])
+    x0 = torch.tensor([start], dtype=dtype, device="cpu").repeat(len(gains["rate"]), 1).to(device)
 
-    def followed() -> SourceRun:
-        times = recorded_times(duration, dt, min(_RECORDED, duration / 20))
-        result = method.run(x0, dt=dt, seed=seed_of(cfg), **times)
-        error = result.state[..., :2] - reference(result.state)[0]
-        return SourceRun(result.time, error, result["theta"], int(result.diverged.sum()))
+    def tracked(source: str) -> Method:
+        tracker = ConcurrentTracker(plant, reference, source=source, size=size, **gains)  # type: ignore[arg-type]
+        return Method(Measured(tracker, noise=[noise, noise, 0.0, 0.0, 0.0], dim=5), plant, cost)
 
-    return followed
+    methods = {name: tracked(source) for source, name in SOURCES.items()}
+    return {name: each.run(x0, dt=dt, seed=seed_of(cfg), **times) for name, each in methods.items()}
+
+
+run.held = lambda cfg: histories(loops(cfg))  # type: ignore[attr-defined]
 
 
 def published() -> ParametricPlant:

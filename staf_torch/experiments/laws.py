@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from omegaconf import DictConfig
+from torch import Tensor
 
 from .. import optim, theory
 from ..engine.predictors import Predictor, Secant, Tangent
@@ -198,7 +199,7 @@ def promises(problem: ChaseProblem, excess: float) -> Metrics:
     """Return the a-priori bounds for the paper's law at the problem's step and iterations: the
     a-priori excess, the step and the iterations that a wanted excess needs, and the paper's own step."""
     system, law = problem.system, optim.SteepestDescent()
-    states = simulate(system, problem.initial_states, dt=problem.dt, steps=problem.steps).flatten(0, 1)
+    states = _states(problem).flatten(0, 1)
     states = states[:: -(-states.shape[0] // _STATES)]
     its, dt = problem.inner_steps, problem.dt
     try:
@@ -218,6 +219,14 @@ def promises(problem: ChaseProblem, excess: float) -> Metrics:
         _log.warning("no a-priori bound: %s", error)
         return {}
     return {name: finite(value) for name, value in found.items()}
+
+
+def _states(problem: ChaseProblem) -> Tensor:
+    """Return the states of all rows and times, (B, T, n)."""
+    return simulate(problem.system, problem.initial_states, dt=problem.dt, steps=problem.steps)
+
+
+run.held = lambda cfg: {"state": _states(chase_problem(cfg))}  # type: ignore[attr-defined]
 
 
 def _with(problem: ChaseProblem, case: LawCase) -> ChaseProblem:

@@ -21,6 +21,7 @@ from ..settings.chase import ChaseProblem, chase_problem
 from ..signs import SHOWN, Progress
 from ..systems import simulate
 from ..tables import Table
+from .chase_batch import histories
 from .registry import Metrics, finite
 from .study import report
 
@@ -75,6 +76,15 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     drawing = (lambda: draw_memory(picture)) if figures else None
     report(out, _log, "memory", Table.of([metrics]), drawing, shown=_shown(metrics))
     return out.metrics(metrics)
+
+
+def held(cfg: DictConfig) -> dict[str, Tensor]:
+    """Return what a run keeps of its rows beside the memory, in which numbers decide."""
+    settings_of(cfg)
+    return histories(chase_problem(cfg))
+
+
+run.held = held  # type: ignore[attr-defined]
 
 
 def settings_of(cfg: DictConfig) -> Settings:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from omegaconf import DictConfig
@@ -22,7 +23,7 @@ from ..settings.chase import generator_of, horizon, initial_states, placement, p
 from ..signs import SHOWN, Progress
 from ..systems import Barrier, ControlAffineSystem, Plant
 from .registry import Metrics, finite
-from .study import Method, Study, label_key, write_history
+from .study import Method, Study, histories, label_key, write_history
 
 _log = logging.getLogger(__name__)
 _COLUMNS = {
@@ -38,37 +39,83 @@ _COLUMNS = {
 _NAMED = 20  # starts that the log lists
 
 
-def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
-    """Run every method from the same states and fill the run directory; `metrics.json` comes last."""
+class BoxProblem(NamedTuple):
+    """The box and what is compared in it, on the device and in the dtype of the settings."""
+
+    box: Barrier
+    cost: Cost
+    methods: dict[str, Method]
+    starts: dict[str, Tensor]  # (B, n) float64: "" as set, "left" anywhere, "left_near" beside a wall
+    dtype: torch.dtype  # of the loops
+    times: dict[str, tuple[int, int]]  # steps from these starts, and steps between records
+
+    def loops(self, cfg: DictConfig, method: Method) -> dict[str, LoopResult]:
+        """Run one method from all starts."""
+        found = {}
+        for what, x in self.starts.items():
+            steps, every = self.times[what]
+            every = 1 if what and method.plant is not self.box else every
+            found[what] = _run(cfg, method, self.box, x.to(self.dtype), steps, every)
+        return found
+
+
+def box_problem(cfg: DictConfig) -> BoxProblem:
+    """Build what the settings describe; designs and starts are made on the CPU.
+
+    Raises:
+        ValueError: if a setting breaks its rule.
+    """
     device, dtype = placement(cfg.device, cfg.dtype)
-    system = plant(cfg).to(device)
+    system = plant(cfg)
     if not isinstance(system, ControlAffineSystem) or system.dim is None:
         raise fail(COMMAND_LINE, "system", "must be a ControlAffineSystem", system)
-    cost = make_cost(cfg, system).to(device)
-    box = Barrier(system, plain(cfg.safe_box.low), plain(cfg.safe_box.high)).to(device)
-    x0 = initial_states(cfg, system.dim).to(device=device, dtype=torch.float64)
-    shooting = optimum_settings(cfg.adp.optimum)
-    others = {"left": _anywhere(cfg, box), "left_near": _beside_walls(cfg, box)}
+    cost = make_cost(cfg, system)
+    box = Barrier(system, plain(cfg.safe_box.low), plain(cfg.safe_box.high))
+    starts = {"": initial_states(cfg, system.dim)}
+    starts |= {"left": _anywhere(cfg, box), "left_near": _beside_walls(cfg, box)}
     dt, steps = horizon(cfg)
     followed = max(1, round(positive_real(COMMAND_LINE, "safe_box.followed", cfg.safe_box.followed) / dt))
     every = next(k for k in range(max(1, steps // 2000), steps + 1) if steps % k == 0)
-    study = Study("safe_box", _COLUMNS, ("cost", "minimum_margin", "constraint_violations"), _log)
     compared = methods(cfg, box, cost)  # asks for the settings' rules before anything takes time
-    best = _optimum(box, cost, box.transform(x0[:1]), shooting) if shooting.shooting else None
+    for part in (box, *(p for method in compared.values() for p in (method.controller, method.cost))):
+        part.to(device)
+    return BoxProblem(
+        *(box, cost, compared, {what: x.to(device) for what, x in starts.items()}, dtype),
+        {"": (steps, every), **dict.fromkeys(("left", "left_near"), (followed, followed))},
+    )
+
+
+def held(cfg: DictConfig) -> dict[str, Tensor]:
+    """Return what a run keeps of the rows of every method."""
+    problem = box_problem(cfg)
+    return histories(
+        {
+            f"{name}, {what.replace('_', ' ')}" if what else name: result
+            for name, method in problem.methods.items()
+            for what, result in problem.loops(cfg, method).items()
+        }
+    )
+
+
+def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
+    """Run every method from the same states and fill the run directory; `metrics.json` comes last."""
+    shooting, problem = optimum_settings(cfg.adp.optimum), box_problem(cfg)
+    box, cost, compared, starts = problem[:4]
+    study = Study("safe_box", _COLUMNS, ("cost", "minimum_margin", "constraint_violations"), _log)
+    best = _optimum(box, cost, box.transform(starts[""][:1]), shooting) if shooting.shooting else None
     study.metrics["optimal_cost"] = best
     results: dict[str, LoopResult] = {}
     margins: dict[str, Tensor] = {}
     for name, method in compared.items():
-        results[name] = _run(cfg, method, box, x0.to(dtype), steps, every)
+        tried = problem.loops(cfg, method)
+        results[name] = tried.pop("")
         margins[name] = _margin(box, method.plant, results[name])
         measured = _measured(results[name], margins[name], best)
-        for what, starts in others.items():
-            recorded = 1 if method.plant is system else followed
-            tried = _run(cfg, method, box, starts.to(dtype), followed, recorded)
-            left = constraint_metrics(tried, _margin(box, method.plant, tried))["constraint_violations"]
-            measured[f"{what}_fraction"] = (left or 0.0) / len(starts)
+        for what, other in tried.items():
+            left = constraint_metrics(other, _margin(box, method.plant, other))["constraint_violations"]
+            measured[f"{what}_fraction"] = (left or 0.0) / len(starts[what])
         study.add("" if name == "LQR of s" else f"{label_key(name)}_", measured, method=name)
-    study.metrics |= _unavoidable(cfg, box, cost, others)
+    study.metrics |= _unavoidable(cfg, box, cost, starts)
     out, first = RunDirectory(directory), results["LQR of s"]
     if cfg.history:
         arrays = {"state": box.inverse(first.state), "barrier_state": first.state, "control": first.control}
@@ -76,6 +123,9 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
         write_history(out, first.time, arrays)
     drawn = _drawn(box, compared, results, margins)
     return study.write(out, (lambda: draw_box(drawn)) if draws(cfg.figures) else None)
+
+
+run.held = held  # type: ignore[attr-defined]
 
 
 def methods(cfg: DictConfig, box: Barrier, cost: Cost) -> dict[str, Method]:
@@ -94,9 +144,6 @@ def methods(cfg: DictConfig, box: Barrier, cost: Cost) -> dict[str, Method]:
         guard = SafetyFilter(lqr, system, kept, dt=dt, decay=float(cfg.safe_box.decay))
         found["LQR of x, filtered"] = Method(guard, system, paid)
     found["LQR of x"] = Method(Feedback(lqr), system, paid)
-    for method in found.values():
-        method.controller.to(box.low.device)
-        method.cost.to(box.low.device)
     return found
 
 
@@ -120,7 +167,8 @@ def _unavoidable(cfg: DictConfig, box: Barrier, cost: Cost, starts: dict[str, Te
     """The starts that no control held for dt keeps inside: their shares, and their numbers in the log."""
     guard = BoxFilter(LQR(box, cost), box, dt=float(cfg.dt))
     found: Metrics = {}
-    for what, x in starts.items():
+    for what in ("left", "left_near"):
+        x = starts[what]
         rows = (guard.share(box.transform(x)) >= 1).nonzero().flatten().tolist()
         found[f"{what}_unavoidable_fraction"] = len(rows) / len(x)
         if rows:

@@ -134,6 +134,20 @@ def write_history(out: RunDirectory, time: Tensor, arrays: Mapping[str, Tensor])
         writer.close(time=time.numpy())
 
 
+def histories(results: Mapping[str, LoopResult]) -> dict[str, Tensor]:
+    """Return what closed loops keep of all rows and times: (B, T, ...) by method and name."""
+    return {
+        f"{method}: {name}" if method else name: array
+        for method, result in results.items()
+        for name, array in {
+            "state": result.state,
+            "control": result.control,
+            "running_cost": result.running_cost,
+            **result.recorded,
+        }.items()
+    }
+
+
 def log_diverged(log: logging.Logger, starts: Tensor | np.ndarray, at: Tensor, also: str = "") -> None:
     """Warn of each diverged trajectory, up to twenty of them by number, and of what ``also`` happens to it.
 

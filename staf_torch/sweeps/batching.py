@@ -14,13 +14,13 @@ from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
+from ..experiments.dry_run import experiment_of
 from ..experiments.registry import (
     BatchedExperiment,
     Experiment,
     Metrics,
     Solution,
     check_animation,
-    experiment,
 )
 from ..figures.style import in_a_sweep
 from ..settings.plain import to_read
@@ -168,7 +168,7 @@ def solve(cfgs: Sequence[DictConfig], progress: Progress) -> list[Outcome]:
     Where the batch as a whole raises, its members are tried one by one, so that only the culprit fails.
     """
     try:
-        study = experiment(to_read(cfgs)[0].task)
+        study = experiment_of(to_read(cfgs)[0])
         if not isinstance(study, BatchedExperiment):
             return [DEFERRED for _ in cfgs]
         with in_a_sweep():
@@ -192,7 +192,7 @@ def completion(cfg: DictConfig, outcome: Outcome) -> Experiment:
         Exception: that of a job that failed, or ValueError for an animation that the experiment has not.
     """
     check_animation(cfg)
-    study = experiment(cfg.task)
+    study = experiment_of(cfg)
     match outcome:
         case Failed(error):
             raise error
@@ -208,7 +208,7 @@ def _group_and_size(settings: Flat, index: int) -> tuple[str, int]:
     """A text that is equal for the members of a group, and the bytes that the solution keeps."""
     key, size = json.dumps(index), 0
     try:
-        study = experiment(settings["task"])
+        study = experiment_of(settings)
         if isinstance(study, BatchedExperiment):
             static = [[name, study.shared(name, value)] for name, value in settings.items()]
             key = json.dumps([study.shape(settings), *static])

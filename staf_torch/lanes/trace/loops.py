@@ -52,7 +52,7 @@ def repeat(
     """
     if (count > 1 or (where is not None and count)) and (tracer := tracer_of(carry)) is not None:
         return _loop(tracer, count, lambda now, _: (body(now), ()), carry, (), 1, where)[0]
-    for _ in range(_passes(count)):
+    for _ in range(_passes(count, carry)):
         if where is None:
             carry = body(carry)
             continue
@@ -66,8 +66,7 @@ def repeat(
 
 @contextmanager
 def few_passes(asked: bool = True) -> Iterator[None]:
-    """Loops in plain torch end, if asked, after a few passes, which call all that the loop calls; a scan
-    repeats the outputs of the last."""
+    """Plain torch's loops end, if asked, after a few passes; a scan repeats the outputs of the last."""
     before = getattr(_active, "few", False)
     _active.few = before or asked
     try:
@@ -76,8 +75,9 @@ def few_passes(asked: bool = True) -> Iterator[None]:
         _active.few = before
 
 
-def _passes(count: int) -> int:
-    return min(count, _FEW) if getattr(_active, "few", False) else count
+def _passes(count: int, given: Tree) -> int:
+    formal = any(leaf.is_meta for leaf in flatten(given)[0])  # where one pass has the shapes of all
+    return min(count, 1 if formal else _FEW if getattr(_active, "few", False) else count)
 
 
 def _chosen(going: Tensor, after: Tree, before: Tree) -> Tree:
@@ -178,7 +178,7 @@ def scan(
             return _loop(tracer, count, body, carry, inputs, dim)
     outputs, shape = [], None
     every = zip(*[leaf.unbind(dim) for leaf in leaves], strict=True)
-    for at in itertools.islice(every, _passes(count)):
+    for at in itertools.islice(every, _passes(count, (carry, inputs))):
         carry, out = body(carry, unflatten(structure, iter(at)))
         parts, shape = flatten(out)
         outputs.append(parts)
