@@ -286,6 +286,7 @@ OWN = (
     *map(MetricInfo, ("final_state_norm", "final_error", "parameter_error", "control_error", "value_error")),
     MetricInfo("regulated_fraction", unit="1", larger_is_better=True, headline=True),
     MetricInfo("diverged_fraction", unit="1"),
+    MetricInfo("history_bytes", unit="B"),
 )
 """The library's own metrics, headlines in the order in which a table shows them."""
 MEANINGS = {
@@ -315,6 +316,7 @@ MEANINGS = {
     "value_error": "largest |V* - V^| over the second half of the time",
     "regulated_fraction": "share of trajectories with |x| < 1e-3 at the end, 0 to 1; larger is better",
     "diverged_fraction": "share of trajectories that became non-finite, 0 to 1",
+    "history_bytes": "bytes of a run's histories, as a dry run (device=meta) counts them",
 }
 """What a reader of a table needs to know of each of the library's own metrics."""
 HEADLINES = tuple(info.name for info in OWN if info.headline)
