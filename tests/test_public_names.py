@@ -118,6 +118,14 @@ def test_all_lists_what_a_package_hands_on(package: str) -> None:
     [
         ("from staf_torch import *; StaF, adp, chase", {"torch"}, {"hydra", "omegaconf", "matplotlib"}),
         (
+            "from staf_torch import adp, systems\nimport torch\nplant = systems.Pendulum()\n"
+            "cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, low=-8.0, high=8.0)\n"
+            "x = torch.ones(1, 2).double() / 9\nadp.near_optimal(plant, cost, dt=0.05)(x)\n"
+            "adp.SafetyFilter(adp.LQR(plant, cost), plant, lambda x, t: x[:, 0] + 1, dt=0.05)(x)",
+            {"torch"},
+            {"sympy"},  # which torch imports with its compiler, 2 s for nothing
+        ),
+        (
             "from staf_torch.cli.table import main\ntry: main(['--help'])\nexcept SystemExit: pass",
             {"staf_torch"},
             {"torch", "numpy", "hydra", "omegaconf", "matplotlib", "pandas", "jinja2"},
@@ -132,7 +140,7 @@ def test_all_lists_what_a_package_hands_on(package: str) -> None:
             {"torch", "matplotlib", "pandas"},
         ),
     ],
-    ids=["library", "staf-table", "version, help, no command, completion and settings"],
+    ids=["library", "two controllers", "staf-table", "version, help, no command, completion and settings"],
 )
 def test_an_import_brings_nothing_that_it_does_not_need(
     program: str, wanted: set[str], unwanted: set[str]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ..lanes.reverse_mode import grad
 from ..numerics.checks import trailing
 from ..numerics.derivatives import row_jacobian
 from .basis import StaFBasis, Target
@@ -56,7 +57,7 @@ def state_jacobian(basis: StaFBasis, x: Tensor, target: Target) -> Tensor:
     """
     trailing("state_jacobian", "x", x, dims=1, last=basis.dim)
     sources = _sources(basis, x, target)
-    slope = torch.func.grad(lambda at: basis.centers.radius(at).sum())(x)  # grad nu, (..., n)
+    slope = grad(lambda at: basis.centers.radius(at).sum())(x)  # grad nu, (..., n)
     outward = (sources * basis.centers.directions.to(x)).sum((-1, -2))  # along u_i, (..., M)
     moved = sources.sum(-2) + outward.unsqueeze(-1) * slope.unsqueeze(-2)
     return _solve(basis, x, moved.unsqueeze(-2)).squeeze(-2)
@@ -69,7 +70,7 @@ def _sources(basis: StaFBasis, x: Tensor, target: Target) -> Tensor:
     slopes = row_jacobian(lambda at: basis.kernel(at, centers), centers)[
         1
     ]  # d_{1,l} k(c_i, c_j), (..., i, j, l)
-    direct = torch.func.grad(lambda at: target(at).sum())(centers)
+    direct = grad(lambda at: target(at).sum())(centers)
     own = direct - (slopes * weights[..., None, :, None]).sum(-2)  # (..., i, l)
     identity = torch.eye(basis.count, dtype=x.dtype, device=x.device).unsqueeze(-1)
     sources: Tensor = identity * own.unsqueeze(-3) - (slopes * weights[..., None, None]).transpose(-3, -2)

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from ..approximation.staf import StaF
+from ..lanes.reverse_mode import grad
 from ..local_basis import GradedSpace
 from ..numerics.checks import hold, positive_real
 
@@ -139,7 +140,7 @@ class LocalApproximator(nn.Module):
     def forward(self, y: Tensor) -> tuple[Tensor, Tensor]:
         """V^ and grad V^: (B, n) -> (B,), (B, n)."""
         z = y.double() - self.state
-        value, gradient = self._value(z), torch.func.grad(lambda at: self._value(at).sum())(z)
+        value, gradient = self._value(z), grad(lambda at: self._value(at).sum())(z)
         return value.to(self.dtype), gradient.to(self.dtype)
 
     def _value(self, z: Tensor) -> Tensor:

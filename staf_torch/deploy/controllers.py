@@ -25,6 +25,7 @@ from ..adp.near_optimal_policy import NearOptimal
 from ..adp.planning.receding_horizon import StrainedPlans
 from ..adp.planning.shooting.optimum import PlanReplay
 from ..lanes.per_row.objects import refuse_rows, row_of
+from ..lanes.reverse_mode import grad
 from ..local_basis.graded import GradedBasis
 from ..numerics.checks import fail, hold, trailing
 from .remembered_policy import RememberedPolicy
@@ -180,7 +181,7 @@ class FoldedRollout(nn.Module):
         unit = space.fit(torch.eye(basis.count, dtype=torch.float64, device="cpu"))  # a row a center
         at = zero.expand(basis.count, 1, -1)
         value = space.evaluate(at, unit).squeeze(-1)
-        slope = torch.func.grad(lambda z: space.evaluate(z, unit).sum())(at).squeeze(-2)  # (M, n)
+        slope = grad(lambda z: space.evaluate(z, unit).sum())(at).squeeze(-2)  # (M, n)
         self.moving = basis.kernel.scale_slope == 1.0
         self.policy = copy.deepcopy(policy)
         if isinstance(policy.base, RolloutPolicy):

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from ..lanes.per_row.objects import OfRows
+from ..lanes.reverse_mode import grad
 from ..numerics.checks import shown, states
 
 
@@ -97,7 +98,7 @@ class Kernel(nn.Module, metaclass=OfRows):
             assert s is not None
             return s.sum()
 
-        gradient: Tensor = torch.func.grad(total)(z)
+        gradient: Tensor = grad(total)(z)
         return gradient
 
     def exponent_rate(self) -> Tensor | None:

@@ -15,6 +15,7 @@ from ..centers import probe_points
 from ..lanes import Program, reduce, shared_program
 from ..lanes.calls.choice import PlainTime, undecided, worth
 from ..lanes.per_row.objects import made_by_rows
+from ..lanes.reverse_mode import grad
 from ..lanes.row_numbers import RowNumbers, over_rows, points_of_rows, some_rows
 from ..local_basis import NewtonSpace, evaluate_scaled, scale
 from ..numerics.linalg import condition_number
@@ -164,7 +165,7 @@ class StateErrorPass:
 def _gradient(function: Target, at: Tensor) -> Tensor:
     """grad f, row by row: (..., n). Not by torch.func, whose first use imports the compiler for a second."""
     if torch._C._functorch.is_functorch_wrapped_tensor(at):  # numbers of rows, in plain torch
-        gradient: Tensor = torch.func.grad(lambda x: function(x).sum())(at)
+        gradient: Tensor = grad(lambda x: function(x).sum())(at)
         return gradient
     with torch.enable_grad():
         at = at.clone().requires_grad_()

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from ..lanes.calls.inputs import seen_by_others
+from ..lanes.reverse_mode import backward, jacrev, vjp
 
 STEP = 6e-6  # the cube root of the rounding error: a central difference is then good to its square
 
@@ -40,7 +41,7 @@ def row_jacobian(function: Callable[[Tensor], Tensor], at: Tensor) -> tuple[Tens
     """Return values (..., *outputs) and derivatives (..., *outputs, n) of a function of rows, in which no
     row sees another, at (..., n): one backward pass for every entry of an output, whatever the number of
     rows."""
-    values, pull = torch.func.vjp(function, at)[:2]
+    values, pull = vjp(function, at)[:2]
     outputs = values.shape[at.dim() - 1 :]
     if not outputs:
         return values, pull(torch.ones_like(values))[0]
@@ -56,7 +57,7 @@ def point_jacobian(function: Callable[[Tensor], Tensor], at: Tensor, count: int)
     A tenth of the time of `torch.func.jacrev`, which is left to transforms and traces.
     """
     if seen_by_others() or torch.is_inference_mode_enabled() or torch.compiler.is_compiling():
-        slopes: Tensor = torch.func.jacrev(function)(at)
+        slopes: Tensor = jacrev(function)(at)
         return slopes.detach()
     points = at.detach().expand(count, -1).clone().requires_grad_()
     with torch.enable_grad():
@@ -65,7 +66,7 @@ def point_jacobian(function: Callable[[Tensor], Tensor], at: Tensor, count: int)
     if not values.requires_grad:
         return torch.zeros(*outputs, len(at), dtype=values.dtype, device=values.device)
     units = torch.eye(count, dtype=values.dtype, device=values.device).view_as(values)
-    found = torch.autograd.grad(values, points, units, materialize_grads=True)[0]
+    (found,) = backward((values,), (points,), (units,), create_graph=False)
     return found.view(*outputs, len(at))
 
 

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from ..approximation.basis import StaFBasis
 from ..lanes.gradients import refuse_gradient
+from ..lanes.reverse_mode import grad
 from ..lanes.threads import ReadWriteLock
 from ..numerics.checks import hold, integer, positive_real, trailing
 
@@ -159,7 +160,7 @@ class ExperienceMemory(nn.Module):
 
     def gradient(self, y: Tensor) -> Tensor:
         """Gradient of the blend at y: (..., P, n) -> (..., P, n)."""
-        return self._asked(torch.func.grad(lambda point: self._query(point).sum()), y)
+        return self._asked(grad(lambda point: self._query(point).sum()), y)
 
     def covered(self, y: Tensor) -> Tensor:
         """Return whether a stored model reaches y: (..., P, n) -> (..., P) bool."""

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ..lanes.gradients import defer_gradient, marked
+from ..lanes.reverse_mode import jacrev
 from ..numerics.derivatives import Apart, central_slopes
 from .base import Linearisation
 from .numpy_in_torch import InTorch, agrees
@@ -112,7 +113,7 @@ class BlackBox:
             return self(z[..., :size], z[..., size:])
 
         if self.torch:
-            slopes: Tensor = torch.func.jacrev(lambda z: whole(z.unsqueeze(0))[0])(at).detach()
+            slopes: Tensor = jacrev(lambda z: whole(z.unsqueeze(0))[0])(at).detach()
         else:
             slopes = central_slopes(whole, at, apart=apart)
             wider = central_slopes(whole, at, 100 * at.abs().clamp(min=1.0), apart)

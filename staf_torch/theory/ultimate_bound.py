@@ -13,6 +13,7 @@ from torch import Tensor
 from ..approximation.basis import StaFBasis, Target
 from ..engine import along, gram_rates
 from ..lanes.per_row.objects import refuse_rows
+from ..lanes.reverse_mode import grad
 from ..numerics.checks import fail, integer, positive_real, trailing
 from ..numerics.linalg import condition_number
 from ..optim import SteepestDescent, UpdateLaw
@@ -295,7 +296,7 @@ def paper_step(
             quadratic = torch.einsum("...i,...ij,...j->...", a, basis.kernel(c, c), a)
             return (quadratic - 2 * (a * target(c)).sum(-1)).sum()
 
-        gradient: Tensor = torch.func.grad(error)(centers.expand(*a.shape, -1)).flatten(-2).norm(dim=-1)
+        gradient: Tensor = grad(error)(centers.expand(*a.shape, -1)).flatten(-2).norm(dim=-1)
         return gradient
 
     kappa = condition_number(basis.gram_structure(states).scaled()).max()
@@ -318,6 +319,6 @@ def _ascend(function: Callable[[Tensor], Tensor], like: Tensor, radius: Tensor) 
     starts = radius * starts / starts.norm(dim=-1, keepdim=True)
     a = starts.view(_STARTS, *[1] * (like.dim() - 1), -1).expand(-1, *like.shape)
     for _ in range(_ASCENTS):
-        gradient: Tensor = torch.func.grad(lambda at: function(at).sum())(a)
+        gradient: Tensor = grad(lambda at: function(at).sum())(a)
         a = radius * gradient / gradient.norm(dim=-1, keepdim=True)
     return function(a).max()

@@ -8,6 +8,7 @@ from typing import ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
+from ...lanes.reverse_mode import jacrev
 from ...numerics.checks import copied, fail, integer, number
 from ...numerics.default_device import device_of
 from ...numerics.row_checks import check_rows
@@ -186,9 +187,9 @@ class ParametricPlant(ControlAffineSystem):
         if float(push.abs().max()) > _AFFINE or float(self.rest_of(at, held).abs().max()) > _AFFINE:
             rule = "must vanish at the set-point, so that the plant rests there whatever theta is"
             raise fail("ParametricPlant", "regressor", rule, push)
-        slopes = [torch.func.jacrev(self.rest_of, argnums=k)(at, held).detach() for k in (0, 1)]
+        slopes = [jacrev(self.rest_of, argnums=k)(at, held).detach() for k in (0, 1)]
         # (n, p, n) and (n, p, m): the parameter to the front.
-        more = [torch.func.jacrev(self.regressor, argnums=k)(at, held).detach().movedim(1, 0) for k in (0, 1)]
+        more = [jacrev(self.regressor, argnums=k)(at, held).detach().movedim(1, 0) for k in (0, 1)]
         return LinearFamily(slopes[0], more[0], slopes[1], more[1])
 
     def _check(self) -> None:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ...lanes import compiled, repeat, scan, traced_as
+from ...lanes.reverse_mode import grad
 from ...numerics.box import LARGEST, minimum_and_slopes
 from ...numerics.checks import fail, integer, positive_real, trailing
 from ...numerics.derivatives import row_jacobian, use_forward_mode
@@ -200,11 +201,11 @@ class PlanProblem:
         curvature = gradient.unsqueeze(-1) * gradient.unsqueeze(-2)
         for h, margin in zip(self.detours.constraints, self.detours.margin.to(y), strict=True):
 
-            def level(y: Tensor, others: Tensor, t: Tensor, h: Any = h) -> Tensor:
+            def level(y: Tensor, others: Tensor, t: Tensor, h: Any = h) -> tuple[Tensor, Tensor]:
                 margin_left: Tensor = h(self.whole(y, others).unsqueeze(0), t)[0]
-                return margin_left
+                return margin_left, margin_left
 
-            slope, value = torch.func.vmap(torch.func.grad_and_value(level))(y, others, t)
+            slope, value = torch.func.vmap(grad(level, has_aux=True))(y, others, t)
             short = (margin - value).unsqueeze(-1)
             heavy = torch.where(short > 0, torch.ones_like(short), 0.0 * short)
             heavy = 2 * self.hold * self.weight * heavy

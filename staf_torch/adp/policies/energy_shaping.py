@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from ...lanes.per_row.objects import OfRows
+from ...lanes.reverse_mode import grad
 from ...numerics.checks import fail, positive_real, trailing
 from ...systems import ControlAffineSystem
 from ..loop.controller import LQR
@@ -77,7 +78,7 @@ class EnergyShaping(nn.Module, metaclass=OfRows):
         trailing("EnergyShaping", "x", x, 1, self.lqr.cost.dim)
         cost = self.lqr.cost
         goal = torch.zeros_like(x) if cost.target is None else cost.target.to(x).expand_as(x)
-        slope: Tensor = torch.func.grad(lambda z: self.energy(z).sum())(x)
+        slope: Tensor = grad(lambda z: self.energy(z).sum())(x)
         power = (self.system.effectiveness(x) * slope.unsqueeze(-1)).sum(-2)  # g' grad E, (..., m)
         short = (self.energy(goal) - self.energy(x)).unsqueeze(-1)
         pumped = cost.saturate(cost.input_of(self.gain * short * power))

@@ -20,6 +20,7 @@ from ...lanes.dependencies.contents import Contents
 from ...lanes.per_row.each_row import each_row
 from ...lanes.per_row.objects import Rowwise
 from ...lanes.prepared_call import Plan
+from ...lanes.reverse_mode import grad
 from ...lanes.row_functions import Rows, check_states
 from ...lanes.row_numbers import RowNumbers, points_of_rows
 from ...lanes.threads import small
@@ -316,9 +317,7 @@ def fitted_slope(basis: StaFBasis, x: Tensor, values: Tensor) -> Tensor:
     """The slope at x of what fits the values at the centers there: (..., n), (..., M) -> (..., n)."""
     space = basis.local(x)
     coefficients = space.fit(values)
-    slope: Tensor = torch.func.grad(lambda z: space.evaluate(z.unsqueeze(-2), coefficients).sum())(
-        torch.zeros_like(x)
-    )
+    slope: Tensor = grad(lambda z: space.evaluate(z.unsqueeze(-2), coefficients).sum())(torch.zeros_like(x))
     return slope
 
 

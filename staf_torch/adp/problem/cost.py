@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from ...lanes.per_row.decisions import in_any_row
 from ...lanes.per_row.objects import OfRows, by_rows
+from ...lanes.reverse_mode import jacrev
 from ...lanes.row_numbers import nonzero, value_of
 from ...numerics.angles import periods_of, turned, wrap, wrap_each
 from ...numerics.box import LARGEST, box_minimum, face_inverses
@@ -261,7 +262,7 @@ class Cost(nn.Module, metaclass=OfRows):
         if self.output is None:
             return self.q
         at = self.q.new_zeros(self.dim) if self.target is None else self.target
-        slope: Tensor = torch.func.jacrev(self.output)(value_of(at)).detach()
+        slope: Tensor = jacrev(self.output)(value_of(at)).detach()
         return slope.mT @ self.q @ slope
 
     def rate(self, x: Tensor, u: Tensor) -> Tensor:

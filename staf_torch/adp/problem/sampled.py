@@ -17,6 +17,7 @@ from ...lanes.gradients import without_gradient
 from ...lanes.per_row.decisions import in_any_row
 from ...lanes.per_row.each_row import first_row
 from ...lanes.per_row.objects import Note, OfRows
+from ...lanes.reverse_mode import vjp
 from ...numerics.angles import turned, unwrapped, wrap
 from ...numerics.checks import fail, hold, integer, trailing
 from ...numerics.default_device import beside, device_of
@@ -422,11 +423,11 @@ def _slopes_and_bends(function: Callable[[Tensor], Tensor], z: Tensor, count: in
     value, entry = (torch.eye(size, dtype=z.dtype, device=z.device) for size in (count, d))
 
     def slopes(z: Tensor) -> Tensor:
-        pull = torch.func.vjp(function, z)[1]
+        pull = vjp(function, z)[1]
         found: Tensor = pull(value.repeat(d, 1).expand(*z.shape[:-1], count))[0]
         return found
 
     at = z.unsqueeze(1).expand(-1, d * count, d).clone()
-    first, pull = torch.func.vjp(slopes, at)[:2]
+    first, pull = vjp(slopes, at)[:2]
     second = pull(entry.repeat_interleave(count, dim=0).expand_as(first))[0]
     return first[:, :count], second.unflatten(1, (d, count)).transpose(1, 2)

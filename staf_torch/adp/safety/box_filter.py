@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from ...lanes import compiled, repeat
 from ...lanes.per_row.objects import OfRows
+from ...lanes.reverse_mode import grad, vjp
 from ...numerics.checks import fail, positive_real, trailing
 from ...numerics.default_device import device_of
 from ...numerics.runge_kutta import runge_kutta_mean, runge_kutta_stages
@@ -181,7 +182,7 @@ class BoxFilter(nn.Module, metaclass=OfRows):
     def inequalities(self, s: Tensor, u: Tensor, hold: Tensor, left: Tensor) -> tuple[Tensor, Tensor]:
         """a_i and c_i of the conditions a_i'u >= c_i, linearised at u, one a wall: (B, n), (B, m), (B,), (B,)
         -> (B, W, m), (B, W)."""
-        value, pull = torch.func.vjp(lambda u: self._conditions(s, u, hold, left), u)  # type: ignore[misc]
+        value, pull = vjp(lambda u: self._conditions(s, u, hold, left), u)
         # Reverse mode: forward mode in plain torch takes a hundred times as long, for its own reasons.
         walls = torch.eye(len(self.walls), dtype=u.dtype, device=u.device)
         normal = torch.func.vmap(lambda one: pull(one.expand_as(value))[0], out_dims=1)(walls)
@@ -264,11 +265,11 @@ def _degrees(box: Barrier) -> list[int]:
             return plant.motion(x, u)[:, k].sum()
 
         def pushed(u: Tensor) -> Tensor:
-            slope = torch.func.grad(speed)(x, u)
+            slope = grad(speed)(x, u)
             rate: Tensor = (slope * plant.motion(x, u)).sum()
             return rate
 
-        effects = torch.func.grad(speed, argnums=1)(x, rest), torch.func.grad(pushed)(rest)
+        effects = grad(speed, argnums=1)(x, rest), grad(pushed)(rest)
         found.append(next((n for n, one in enumerate(effects, 1) if bool((one.abs() > _NOTHING).any())), 0))
     return found
 

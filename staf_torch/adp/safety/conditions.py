@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from ...lanes.per_row.decisions import agreed, in_any_row
+from ...lanes.reverse_mode import grad, jacrev
 from ...numerics.checks import fail, non_negative, one_or_each, positive, trailing
 from ...numerics.default_device import device_of
 from ...numerics.linalg import shortest_solution
@@ -159,7 +160,7 @@ class Conditions(nn.Module):
             ends, end, middle = self._held(k, x, u, t)
             return end, (end, ends, middle)
 
-        slope, (end, ends, middle) = torch.func.grad(held, has_aux=True)(u)
+        slope, (end, ends, middle) = grad(held, has_aux=True)(u)
         miss = self._required(k, ends, end, middle) - end
         if self.degree[k] == 2:
 
@@ -167,7 +168,7 @@ class Conditions(nn.Module):
                 gap = self._stop(k, self._held(k, x, u, t)[0])
                 return gap, gap
 
-            other, gap = torch.func.grad(stop, has_aux=True)(u)
+            other, gap = grad(stop, has_aux=True)(u)
             first, second = slope.square().sum().sqrt(), other.square().sum().sqrt()
             harder = (-gap * first > miss * second) & (gap < 0)
             slope, miss = torch.where(harder, other, slope), torch.where(harder, -gap, miss)
@@ -187,7 +188,7 @@ class Conditions(nn.Module):
             return found, found
 
         rest = self.plant.resting_input().to(x).unsqueeze(0)
-        slope, drift = torch.func.grad(push, has_aux=True)(rest)
+        slope, drift = grad(push, has_aux=True)(rest)
         low, high = self.low.to(x), self.high.to(x)
         farther = torch.where(slope > 0, slope * (high - rest), slope * (low - rest))
         ability = drift + torch.where(slope == 0, 0.0, farther).sum()
@@ -211,7 +212,7 @@ class Conditions(nn.Module):
         value = h(x, t) - self.margin[k].to(x)
         if self.degree[k] == 1:
             return value, torch.zeros_like(value), torch.ones_like(value)
-        along_x, along_t = torch.func.grad(h, argnums=(0, 1))(x, t)
+        along_x, along_t = grad(h, argnums=(0, 1))(x, t)
         rate = (along_x * self.plant.motion(x, rest.to(x).unsqueeze(0))).sum() + along_t
         return value, rate, along_x.square().sum()
 
@@ -297,7 +298,7 @@ class Conditions(nn.Module):
             def rate(u: Tensor, x: Tensor, t: Tensor, phi: RowValue = phi) -> Tensor:
                 return rate_along(phi, self.plant, x, u, t)
 
-            effect = torch.func.vmap(torch.func.grad(rate), in_dims=(None, 0, 0))(rest, x, t)
+            effect = torch.func.vmap(grad(rate), in_dims=(None, 0, 0))(rest, x, t)
             if bool((effect.abs() > _NOTHING).any()):
                 return which
         return 0
@@ -395,7 +396,7 @@ def _weakness(of: Conditions, k: int, x: Tensor, t: Tensor, usual: Tensor) -> Te
 
     edge = x
     for _ in range(6):  # Newton's steps of least length
-        slope, value = torch.func.vmap(torch.func.jacrev(off, has_aux=True))(edge, t)
+        slope, value = torch.func.vmap(jacrev(off, has_aux=True))(edge, t)
         edge = edge - shortest_solution(torch.nan_to_num(slope), value)
         if not in_any_row(value.abs() > _ON_EDGE):
             break
@@ -439,6 +440,6 @@ def number(h: Constraint) -> RowValue:
 
 def rate_along(phi: RowValue, plant: Plant, x: Tensor, u: Tensor, t: Tensor) -> Tensor:
     """d phi / dt along the plant: (1, n), (1, m), () -> ()."""
-    along_x, along_t = torch.func.grad(phi, argnums=(0, 1))(x, t)
+    along_x, along_t = grad(phi, argnums=(0, 1))(x, t)
     rate: Tensor = (along_x * plant.motion(x, u)).sum() + along_t
     return rate

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from ...lanes import repeat, where_rows
 from ...lanes.per_row.decisions import in_any_row, is_of_rows
+from ...lanes.reverse_mode import grad, jacrev
 from ...lanes.trace.loops import repeat_counted
 from ..loop.controller import Policy
 from .conditions import Conditions, Ends, Lean
@@ -269,12 +270,10 @@ def opposition(of: Conditions, policy: Policy | None) -> Opposed:
     plant = of.plant
     rest, at = plant.resting_input().double(), plant.equilibrium().double()
     try:
-        a, b = torch.func.jacrev(plant.motion, argnums=(0, 1))(at, rest)
-        gain = (
-            torch.zeros_like(b.mT) if policy is None else -torch.func.jacrev(policy)(at).reshape(b.mT.shape)
-        )
+        a, b = jacrev(plant.motion, argnums=(0, 1))(at, rest)
+        gain = torch.zeros_like(b.mT) if policy is None else -jacrev(policy)(at).reshape(b.mT.shape)
     except Exception:  # a policy that no derivative passes through is not linearised
-        a, b = torch.func.jacrev(plant.motion, argnums=(0, 1))(at, rest)
+        a, b = jacrev(plant.motion, argnums=(0, 1))(at, rest)
         gain, policy = torch.zeros_like(b.mT), None
     a, b, gain = a.detach(), b.detach(), gain.detach().to(a)
     closed = a - b @ gain
@@ -285,7 +284,7 @@ def opposition(of: Conditions, policy: Policy | None) -> Opposed:
     lost = torch.zeros_like(fast > 0) if alone is None else alone > _UNSTABLE * fast  # nothing comes back
     rates = list[Tensor]()
     x, _ = of._around()
-    normals = [torch.func.vmap(torch.func.grad(lambda x, h=h: h(x.unsqueeze(0), x.new_zeros(()))[0]))
+    normals = [torch.func.vmap(grad(lambda x, h=h: h(x.unsqueeze(0), x.new_zeros(()))[0]))
                for h in of.constraints]  # fmt: skip
     for k, normal in enumerate(normals):
         along = [(c, a, b, closed, of.decay[k], of.degree[k], modes.real.max()) for c in normal(x[:8])]
@@ -325,7 +324,7 @@ def _growth(
 def _fastest(of: Conditions) -> Tensor:
     """Return the fastest rate of the plant at its equilibrium, 1/s: below it lie steps of the brakes."""
     at, rest = of.plant.equilibrium().double(), of.plant.resting_input().double()
-    a = torch.func.jacrev(of.plant.motion)(at, rest).detach()
+    a = jacrev(of.plant.motion)(at, rest).detach()
     finite = torch.isfinite(a).all()
     return torch.where(finite, torch.linalg.matrix_norm(torch.where(finite, a, 0.0)), torch.inf)
 

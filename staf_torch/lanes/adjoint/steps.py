@@ -17,6 +17,7 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from ..calls.inputs import Given
+from ..reverse_mode import vjp
 from ..row_numbers import RowNumbers
 from ..trace.step import Step, Traced, trace
 from ..trace.tracer import NotLoweredError
@@ -88,7 +89,7 @@ def adjoint_step(
             chosen = zip(made, (*wanted.carry, *wanted.outputs), strict=True)
             return tuple(leaf for leaf, one in chosen if one)
 
-        _, pull = torch.func.vjp(forward, *given)[:2]
+        _, pull = vjp(forward, *given)[:2]
         found_slopes = iter(pull((*slopes, *ends)))
         earlier = [next(found_slopes) for one in wanted.carry if one]
         at_times = [
