@@ -152,6 +152,12 @@ def test_an_experiment_runs_on_a_device_with_the_numbers_of_the_cpu(
     }
 
 
+def test_an_experiment_of_the_cpu_says_so_where_a_device_is_asked_for(tmp_path: Path) -> None:
+    line = "experiment=flat_limit flat_limit.radii.smallest=0.1 flat_limit.counts=[3] figures=false"
+    found = run(tmp_path, *line.split(), f"device={DEVICE.type}")
+    assert "the task flat_limit computes on the CPU and not on lazy" in found.log
+
+
 def test_what_was_made_on_the_cpu_serves_states_that_are_elsewhere() -> None:
     masses = st.rows(torch.tensor([0.5, 2.0], dtype=torch.float64))
     plant, cost = systems.Pendulum(mass=masses), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
@@ -334,6 +340,18 @@ def test_on_the_meta_device_a_million_steps_are_one() -> None:
     assert chase.weights.shape == (2, steps + 1, 6)
     (slope,) = torch.autograd.grad(chase.excess.sum() + loop.cost.sum(), x)
     assert (slope.shape, slope.device) == (x.shape, META)
+
+
+def test_on_the_meta_device_a_loop_takes_one_pass_for_all() -> None:
+    x, passes = X0.to(META), list[int]()
+
+    def body(now: Tensor, given: Tensor) -> tuple[Tensor, Tensor]:
+        passes.append(1)
+        return now + given, now[:, :1]
+
+    assert lanes.repeat(10**9, lambda now: body(now, now)[0], x).shape == x.shape
+    end, outputs = lanes.scan(body, x, x.unsqueeze(1).expand(2, 1000, 2))
+    assert (end.shape, outputs.shape, len(passes)) == (x.shape, (2, 1000, 1), 2)
 
 
 def test_a_basis_built_on_the_meta_device_has_shapes_before_it_has_values() -> None:

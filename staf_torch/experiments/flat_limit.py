@@ -34,7 +34,7 @@ from ..signs import SHOWN, Progress
 from ..tables import Table
 from ..targets import Paper
 from .registry import Metrics, finite
-from .study import report
+from .study import report, tell_of_cpu
 
 _log = logging.getLogger(__name__)
 _POINTS = 9  # of the ball at which the approximants are compared
@@ -196,6 +196,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     """Run what the settings describe and fill the run directory; `metrics.json` comes last."""
     problem = problem_of(cfg)
     figures = draws(cfg.figures)
+    tell_of_cpu(cfg, _log, "what is compared is rounding, in both dtypes")
     samples = solve(problem, progress)
     out = RunDirectory(directory)
     drawing = (lambda: draw_errors(_panels(samples), rows=len(DTYPES))) if figures else None

@@ -25,7 +25,7 @@ from ..tables.model import significant
 from .registry import Metrics
 from .rival_methods import METHODS, Begin, Rival, UnsuitableError, ipopt_program
 from .rival_plants import CASES, RivalPlant
-from .study import Study, label_key
+from .study import Study, label_key, tell_of_cpu
 
 _log = logging.getLogger(__name__)
 _ROUNDED = 1e-6  # of the range of an input, beyond which it violates its bound: solvers round
@@ -66,6 +66,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     slow = min(states, integer(COMMAND_LINE, "rivals.slow", settings.slow, least=1))
     calls = integer(COMMAND_LINE, "rivals.calls", settings.calls, least=1)
     seed = seed_of(cfg)
+    tell_of_cpu(cfg, _log, "every method is timed there, others' programs among them")
     study, out = Study("rivals", _COLUMNS, (), _log, digits=5), RunDirectory(directory)
     for case in progress.each(cases, "plants"):
         for method, measured, more in compare(case, chosen, case.states(states, seed), calls, slow):

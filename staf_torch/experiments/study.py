@@ -8,10 +8,12 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from omegaconf import DictConfig
 from torch import Tensor
 
 from ..figures.style import images
 from ..results.run_directory import Printable, RunDirectory
+from ..settings.chase import placement
 from ..systems import Plant
 from ..tables import Style, Table
 from ..tables.model import significant
@@ -115,6 +117,13 @@ def recorded_times(duration: float, dt: float, between: float) -> dict[str, int]
     """Return `steps` and `every` of `simulate` for records about ``between`` seconds apart."""
     every = max(1, round(between / dt))
     return {"steps": every * max(1, round(duration / dt / every)), "every": every}
+
+
+def tell_of_cpu(cfg: DictConfig, log: logging.Logger, why: str) -> None:
+    """Log that an experiment computes on the CPU, and why, where the settings name another device."""
+    device, _ = placement(cfg.device, cfg.dtype)
+    if device.type != "cpu":
+        log.warning("the task %s computes on the CPU and not on %s: %s", cfg.task, device, why)
 
 
 def trajectories(count: int) -> str:
