@@ -463,25 +463,48 @@ def same_there(call: Callable[[str], Any]) -> bool:
     return away < 1e-9
 
 
-def registers(only: str, architectures: tuple[int, ...]) -> int:
-    """Compile the kernels with nvcc for several architectures; print their registers and what is spilled."""
-    bad = 0
+SPILLING = {
+    "M = 15 Nesterov": "1 % of the 52 kB that a step moves; with shared memory 192 bytes remain",
+    "M = 15 HeavyBall": "1 % of the 52 kB that a step moves; with shared memory 296 bytes remain",
+    "M = 15 RecursiveLeastSquares": "72 bytes of 18 kB: its matrices of 225 numbers lie there",
+    "M = 6 RecursiveLeastSquares": "20 kB a step; 252 kB with its matrices of 36 numbers in arrays",
+}
+"""Kernels of float64 that spill, and why no other form is taken: counted in their machine code for sm_90."""
+
+
+def programs(only: str) -> Iterator[tuple[str, torch.dtype, Callable[[], Any]]]:
+    """Yield a call of every program whose name has these letters."""
     for name, (make, _) in KINDS.items():
-        for dtype in (torch.float64, torch.float32):
-            if only not in name:
-                continue
+        for dtype in (torch.float64, torch.float32) if only in name else ():
             torch.manual_seed(0)
             case = make(3, dtype)
-            with lanes.compiling("always"), lanes.device.recorded() as texts:
-                case.call(*case.inputs)
-            for text in texts:
-                found = ptxas(text, architectures)
-                spilled = sum(each[1] for each in found.values())
-                bad |= int(spilled > 0)
-                told = ", ".join(
-                    f"sm_{a} {r} registers {s} spilled {f} stack" for a, (r, s, f) in found.items()
-                )
-                print(f"{name:28} {str(dtype)[6:]:8} {told}", flush=True)
+            yield name, dtype, functools.partial(case.call, *case.inputs)
+    sys.path.insert(0, str(Path(__file__).parent))
+    from tests.gpu_programs import PROGRAMS
+
+    for name, call in PROGRAMS.items():
+        if only in name:
+            yield name, torch.float64, call
+
+
+def registers(only: str, architectures: tuple[int, ...]) -> int:
+    """Compile the kernels with nvcc for several architectures; print their registers and what is spilled."""
+    bad, seen = 0, set[str]()
+    for name, dtype, call in programs(only):
+        with lanes.compiling("always"), lanes.device.recorded() as texts:
+            call()
+        for text in [text for text in texts if name in KINDS or text not in seen]:
+            seen.add(text)
+            found = ptxas(text, architectures)
+            spilling = any(each.spilled for each in found.values())
+            why = SPILLING.get(name, "") if spilling else ""
+            bad |= int(spilling and not why)
+            told = ", ".join(
+                f"sm_{a} {of.registers} registers {of.spilled} spilled {of.stack} stack"
+                + f" {of.shared} shared" * (of.shared > 0)
+                for a, of in found.items()
+            )
+            print(f"{name:28} {str(dtype)[6:]:8} {told}{why and f'; {why}'}", flush=True)
     return bad
 
 

@@ -260,15 +260,15 @@ def test_a_chase_that_is_made_again_is_one_kernel() -> None:
         torch.testing.assert_close(again(states), defined(states), rtol=1e-12, atol=1e-12)
     assert len(texts) == 1
     if shutil.which("nvcc") is not None:
-        assert all(spilled == 0 for _, spilled, _ in ptxas(texts[0]).values())
+        assert all(of.spilled == 0 for of in ptxas(texts[0]).values())
 
 
 @pytest.mark.skipif(shutil.which("nvcc") is None, reason="no compiler of CUDA")
 @pytest.mark.parametrize("dtype", [torch.float32])
 def test_kernels_compile_and_keep_their_numbers_in_registers(dtype: torch.dtype) -> None:
-    for used, spilled, _ in ptxas(lanes.Program(flow).cuda_source(*given(2, dtype))).values():
-        assert 0 < used < 255
-        assert spilled == 0
+    for of in ptxas(lanes.Program(flow).cuda_source(*given(2, dtype))).values():
+        assert 0 < of.registers < 255
+        assert of.spilled == 0
 
 
 KERNELS = {
@@ -287,9 +287,9 @@ def test_kernels_spill_no_more_than_is_recorded(name: str) -> None:
     known = recorded(name, "float64", 90)
     assert len(known) == len(texts)
     for text, (_, spilled, stack) in zip(texts, known, strict=True):
-        _, now, memory = ptxas(text, (90,))[90]
-        assert now <= spilled
-        assert memory <= stack
+        of = ptxas(text, (90,))[90]
+        assert of.spilled <= spilled
+        assert of.stack <= stack
 
 
 # No step reads a tensor back to the host: on the meta device, which has no numbers, that would raise.

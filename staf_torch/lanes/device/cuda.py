@@ -15,7 +15,7 @@ import itertools
 import logging
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,22 +23,29 @@ import torch
 
 from ...signs import Sign
 from ..compilation.cache import cache, found, publish, scratch, used
-from ..emit.cuda import FEWER_REGISTERS, KERNEL
+from ..emit.cuda import FEWER_REGISTERS, KERNEL, with_shared_memory
 from ..threads import Mutex
 
 _log = logging.getLogger(__name__)
 REMEDY = "install torch with CUDA, or `pip install staf-torch[cuda]`"
 _OPTIONS = ("--std=c++17", "--fmad=false", "--ptxas-options=-v")
 _STACK = re.compile(r"(\d+) bytes stack frame, (\d+) bytes spill stores")
-_USED = re.compile(r"Used (\d+) registers")
+_USED, _SHARED = re.compile(r"Used (\d+) registers"), re.compile(r"(\d+) bytes smem")
 _REGISTERS, _STEP, _WARPS = 512, 8, 16  # that warps share of a lane, are given at once; warps at most
 _DIGEST = 32
+_SHARED_SPILLS = 13000  # the first version of CUDA that keeps in shared memory what registers lack room for
 _LONG_ARGUMENTS = 12010  # the first version of CUDA of which a kernel's arguments may take 32764 bytes
 _WARP, _BLOCK = 32, 128
 _FEW = 8  # warps a multiprocessor up to which every warp is a block, so that all multiprocessors have some
 _NO_CONTEXT = (3, 201)  # not initialised, invalid context
-_NUMBER_OF_REGISTERS, _LOCAL_BYTES = 4, 3  # attributes of a function
+_MOST_THREADS, _NUMBER_OF_REGISTERS, _LOCAL_BYTES = 0, 4, 3  # attributes of a function
 _lock = Mutex()
+
+
+class LoadedKernel(ctypes.c_void_p):
+    """A kernel that is loaded."""
+
+    block = _BLOCK  # threads
 
 
 class CudaDevice:
@@ -54,11 +61,11 @@ class CudaDevice:
         self._few = _FEW * _WARP * int(properties.multi_processor_count)
         self.architecture = 10 * int(properties.major) + int(properties.minor)
         self._memory = int(properties.total_memory)
-        self._kernels: dict[str, ctypes.c_void_p] = {}
+        self._kernels: dict[str, LoadedKernel] = {}
         self._launch = _driver().cuLaunchKernel
         self._stream = torch._C._cuda_getCurrentRawStream
 
-    def compile(self, text: str) -> ctypes.c_void_p:
+    def compile(self, text: str) -> LoadedKernel:
         """Return the kernel of a text, loaded.
 
         Raises:
@@ -72,11 +79,13 @@ class CudaDevice:
                     kernel = self._kernels[text] = self._loaded(code)
             return kernel
 
-    def _loaded(self, code: bytes) -> ctypes.c_void_p:
-        driver, module, kernel = _driver(), ctypes.c_void_p(), ctypes.c_void_p()
+    def _loaded(self, code: bytes) -> LoadedKernel:
+        driver, module, kernel, most = _driver(), ctypes.c_void_p(), LoadedKernel(), ctypes.c_int()
         self._with_context()
         _checked(driver.cuModuleLoadData(ctypes.byref(module), code))
         _checked(driver.cuModuleGetFunction(ctypes.byref(kernel), module, KERNEL.encode()))
+        _checked(driver.cuFuncGetAttribute(ctypes.byref(most), _MOST_THREADS, kernel))
+        kernel.block = min(_BLOCK, most.value)
         return kernel
 
     def _with_context(self) -> None:
@@ -111,12 +120,12 @@ class CudaDevice:
             read[name] = value.value
         return read
 
-    def launch(self, kernel: ctypes.c_void_p, arguments: ctypes.Array[ctypes.c_char], rows: int) -> None:
+    def launch(self, kernel: LoadedKernel, arguments: ctypes.Array[ctypes.c_char], rows: int) -> None:
         """Put a kernel for so many rows on the stream that torch has on this device now."""
         if torch._C._cuda_getDevice() != self.index:
             with torch.cuda.device(self.index):
                 return self.launch(kernel, arguments, rows)
-        block = _WARP if rows <= self._few else _BLOCK
+        block = _WARP if rows <= self._few else kernel.block
         given = (ctypes.c_void_p * 1)(ctypes.addressof(arguments))
         grid = -(-rows // block), 1, 1, block, 1, 1
         failed = self._launch(kernel, *grid, 0, self._stream(self.index), given, None)
@@ -224,25 +233,25 @@ class Nvrtc:
     def compile(self, text: str, architecture: int) -> bytes:
         """Return machine code, or PTX of the latest that it knows where a card is newer.
 
-        What does not fit into registers is compiled once more for fewer, and the better one is taken
-        (`fewer_is_better`).
+        What does not fit into registers is compiled in other ways, too (`best`).
         Where a few registers less let one more warp run beside the others it has those, if nothing is
         stored for it (six percent of a chase with three centers on an H200).
 
         Raises:
             OSError: with what it says.
         """
-        found = self._compiled(text, architecture, ())
+
+        def compiled(text: str, *more: str) -> MachineCode:
+            return self._compiled(text, architecture, more)
+
+        found, spilled = best(text, compiled, shared=self.number >= _SHARED_SPILLS)
         most = _with_one_more_warp(found.registers)
-        if found.spilled:
-            other = self._compiled(text, architecture, (FEWER_REGISTERS,))
-            found = other if other.stack < found.stack else found
-        elif most:
-            other = self._compiled(text, architecture, (f"--maxrregcount={most}",))
+        if most and not spilled:
+            other = compiled(text, f"--maxrregcount={most}")
             found = found if other.stack > found.stack else other
         return found.code
 
-    def _compiled(self, text: str, architecture: int, more: tuple[str, ...]) -> _MachineCode:
+    def _compiled(self, text: str, architecture: int, more: tuple[str, ...]) -> MachineCode:
         known = self.architectures()
         latest = max((each for each in known if each <= architecture), default=architecture)
         kind = "sm" if architecture in known else "compute"
@@ -257,10 +266,7 @@ class Nvrtc:
             told = self._read("ProgramLog", program).decode(errors="replace")
         finally:
             library.nvrtcDestroyProgram(ctypes.byref(program))
-        stack, spilled = zip(*_STACK.findall(told) or [(0, 0)], strict=True)
-        return _MachineCode(
-            code, max(map(int, _USED.findall(told)), default=0), sum(map(int, stack)), sum(map(int, spilled))
-        )
+        return measured(code, told)
 
     def _read(self, what: str, program: ctypes.c_void_p) -> bytes:
         size = ctypes.c_size_t()
@@ -270,13 +276,22 @@ class Nvrtc:
         return held.raw
 
 
-class _MachineCode(NamedTuple):
+class MachineCode(NamedTuple):
     """Machine code; its registers, the bytes of a thread's memory, and of registers that are stored there."""
 
     code: bytes
     registers: int
     stack: int
     spilled: int
+    shared: int = 0  # bytes of a block's memory
+
+
+def measured(code: bytes, told: str) -> MachineCode:
+    """Return machine code with what the compiler logs of it (``-v``)."""
+    stack, spilled = zip(*_STACK.findall(told) or [(0, 0)], strict=True)
+    most = max(map(int, _USED.findall(told)), default=0)
+    shared = max(map(int, _SHARED.findall(told)), default=0)
+    return MachineCode(code, most, sum(map(int, stack)), sum(map(int, spilled)), shared)
 
 
 def _with_one_more_warp(registers: int) -> int:
@@ -286,12 +301,32 @@ def _with_one_more_warp(registers: int) -> int:
     return most if warps < _WARPS and registers - most <= _STEP else 0
 
 
-def fewer_is_better(found: Sequence[int], fewer: Sequence[int]) -> bool:
-    """Return whether a kernel for fewer registers is better: bytes of a thread's memory, of them spilled.
+def best(text: str, compiled: Callable[..., MachineCode], *, shared: bool = True) -> tuple[MachineCode, bool]:
+    """Compile a kernel; where registers are spilled for fewer of them, too, then with shared memory.
 
-    Some numbers that are spilled, and read rarely, cost less than whole vectors in memory.
+    Some numbers that are spilled, and read rarely, cost less than whole vectors in memory: for fewer
+    registers it is taken with less of a thread's memory, or where nothing is spilled and it is little more;
+    with shared memory, which the cache of a thread's memory then lacks, where nothing is spilled any more.
+
+    Args:
+        text: of the kernel.
+        compiled: compiles a text with options.
+        shared: whether the compiler can keep in shared memory what it spills.
+
+    Returns:
+        The machine code that is taken, and whether the first one spilled registers.
     """
-    return fewer[0] < found[0] or (fewer[1] == 0 and 2 * fewer[0] <= 3 * found[0])
+    first = found = compiled(text)
+    options: tuple[str, ...] = ()
+    if not first.spilled:
+        return first, False
+    fewer = compiled(text, FEWER_REGISTERS)
+    if fewer.stack < first.stack or (fewer.spilled == 0 and 2 * fewer.stack <= 3 * first.stack):
+        found, options = fewer, (FEWER_REGISTERS,)
+    if found.spilled and shared:
+        other = compiled(with_shared_memory(text), *options)
+        found = found if other.spilled else other
+    return found, True
 
 
 @functools.cache

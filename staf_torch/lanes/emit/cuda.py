@@ -43,6 +43,8 @@ _KNOWN = 256  # numbers of an array that it knows, where a pass that is written 
 _PARTS = {"i0_2": 4, "u2 =": 2}  # passes over parts of a matrix that are written out
 FEWER_REGISTERS = "-DFEWER_REGISTERS"
 """An option for a compiler that has too few registers: sums of products are not written out all at once."""
+_SHARED_BLOCK = 32
+"""Threads of a block at most, of a kernel that keeps in shared memory what registers have no room for."""
 _PRELUDE = """#ifndef NAN
 #define NAN __int_as_float(0x7fffffff)
 #endif
@@ -278,6 +280,17 @@ class _CudaWriter(ScalarWriter, TableWriter):
         for e, node in enumerate(nodes):
             value = _as(dtype, self.real, self._ref(node, 0), self.graph.type[node])
             self._line(f"call.{name}[{at}{f' + {e} * rows' if e else ''}] = {value};")
+
+
+def with_shared_memory(text: str) -> str:
+    """Return the text of a kernel that keeps in its block's shared memory what registers have no room for.
+
+    A compiler before CUDA 13.0 does not do so. It takes no more than leaves the warps of a multiprocessor.
+    """
+    name = f"{KERNEL}(const __grid_constant__ Call call)\n{{\n"
+    head, kernel, body = text.rpartition(name)
+    asked = '    asm volatile(".pragma \\"enable_smem_spilling\\";");\n'
+    return f"{head}__launch_bounds__({_SHARED_BLOCK}) {kernel}{asked}{body}" if kernel else text
 
 
 def in_arguments(numbers: int, single: bool) -> bool:
