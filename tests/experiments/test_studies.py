@@ -146,7 +146,7 @@ def test_in_the_box_only_the_policies_of_barrier_coordinates_stay_where_a_contro
     assert metrics["lqr_of_x_filtered_cost"] == metrics["lqr_of_x_cost"]  # bit for bit: no wall is near
     assert len(result.rows("safe_box")) == 5
     with np.load(result.directory / "history.npz") as history:
-        assert history["state"].shape == history["barrier_state"].shape == (2, 6, 2)
+        assert history["state"].shape == history["barrier_state"].shape == (1, 3, 2)
         assert float(history["margin"].min()) == pytest.approx(metrics["minimum_margin"])
     with pytest.raises(ValueError, match=r"must lie strictly between the walls .* not so row 0"):
         run(tmp_path, *words("safe_box"), "safe_box.low=[-6,-5]")
