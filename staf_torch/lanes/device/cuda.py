@@ -7,6 +7,7 @@ launch is then two microseconds of Python, knows nothing of tensors, and is reco
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
 import hashlib
@@ -324,8 +325,9 @@ def best(text: str, compiled: Callable[..., MachineCode], *, shared: bool = True
     if fewer.stack < first.stack or (fewer.spilled == 0 and 2 * fewer.stack <= 3 * first.stack):
         found, options = fewer, (FEWER_REGISTERS,)
     if found.spilled and shared:
-        other = compiled(with_shared_memory(text), *options)
-        found = found if other.spilled else other
+        with contextlib.suppress(OSError):  # of a compiler that does not take it
+            other = compiled(with_shared_memory(text), *options)
+            found = found if other.spilled else other
     return found, True
 
 
