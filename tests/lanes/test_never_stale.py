@@ -228,6 +228,17 @@ def test_a_write_that_torch_does_not_count_is_seen(how: str, size: int, learned:
         torch.testing.assert_close(*slopes)
 
 
+@pytest.mark.parametrize("shape", [(2, 2), (2, 1)])
+def test_a_matrix_that_is_turned_in_place_is_seen(shape: tuple[int, int]) -> None:
+    """No number of its memory moves."""
+    matrix, x = torch.rand(shape, dtype=torch.float64), torch.rand(3, 2, dtype=torch.float64)
+    program = lanes.Program(lambda carry, now, row: (carry + (carry.unsqueeze(-1) * matrix).sum(1), carry))
+    program(x, steps=2)
+    for _ in range(2):
+        matrix.t_()
+        torch.testing.assert_close(program(x, steps=2), program.definition(x, steps=2))
+
+
 def test_another_default_dtype_is_that_of_the_numbers_that_a_step_makes() -> None:
     x, before = torch.rand(3, 2, dtype=torch.float64), torch.get_default_dtype()
 

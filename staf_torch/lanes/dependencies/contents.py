@@ -154,7 +154,7 @@ class Contents:
     def renewed(self) -> bool:
         """Return whether floating-point numbers alone have changed; they count from now on."""
         then, self._writes = self._writes, self._writes.again()
-        if self.unchanged(library=False) and self._structural.none():
+        if self._writes.alike(then) and self.unchanged(library=False) and self._structural.none():
             return True
         self._writes = then
         return False

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from ..row_numbers import all_rows
 
-_VERSION, _BYTES = operator.attrgetter("_version"), operator.methodcaller("tobytes")
+_VERSION, _SHAPE = operator.attrgetter("_version"), operator.attrgetter("shape")
+_BYTES = operator.methodcaller("tobytes")
 _SMALL = 1 << 16  # bytes of a tensor that are compared at every call
 _FEW = 64  # numbers of a larger one
 
@@ -33,8 +34,8 @@ class Writes:
 
     Torch counts writes to a tensor, but none to ``tensor.data`` (``target.data.copy_(...)``) or by NumPy,
     nor that ``tensor.data = other`` gives it other memory, as `torch.nn.utils.vector_to_parameters` does. So
-    memory of the processor is compared: all of it up to 64 kB a tensor and where torch counts nothing, 64
-    numbers of a larger one beside torch's count. On a device it is torch's count alone, as looking waits.
+    memory of the processor is compared, too: all of it up to 64 kB a tensor and where torch counts nothing,
+    64 numbers of a larger one. On a device it is torch's count alone, as looking waits.
 
     Args:
         tensors: numbers of rows among them.
@@ -46,8 +47,9 @@ class Writes:
         # Kept, so that other memory cannot come to lie at the same address meanwhile.
         self._memory = [tensor.untyped_storage() for tensor in self._placed]
         self._addresses = [*map(Tensor.data_ptr, self._placed)]
+        self._shapes = [*map(_SHAPE, self._tensors)]
         self._views = list[memoryview]()
-        self._samples, compared = list[np.ndarray[Any, Any]](), set[int]()
+        self._samples = list[np.ndarray[Any, Any]]()
         for tensor, address in zip(self._placed, self._addresses, strict=True):
             if not tensor.is_cpu:
                 continue
@@ -55,11 +57,11 @@ class Writes:
             memory = memoryview((ctypes.c_char * size).from_address(address))
             if size <= _SMALL or tensor.is_inference():
                 self._views.append(memory)
-                compared.add(id(tensor))
             else:
                 width = min(tensor.element_size(), 8)
                 self._samples.append(np.frombuffer(memory, f"u{width}")[:: size // (width * _FEW)])
-        self._counted = [each for each in self._tensors if not (id(each) in compared or each.is_inference())]
+        # Torch also counts what moves no number: `matrix.t_()`.
+        self._counted = [tensor for tensor in self._tensors if not tensor.is_inference()]
         self._look()
 
     def _look(self) -> None:
@@ -69,18 +71,23 @@ class Writes:
 
     def again(self) -> Writes:
         """Return how the same tensors are now."""
-        if [*map(Tensor.data_ptr, self._placed)] != self._addresses:
+        same = [*map(Tensor.data_ptr, self._placed)] == self._addresses
+        if not same or [*map(_SHAPE, self._tensors)] != self._shapes:
             return Writes(self._tensors)
         now = copy.copy(self)
         now._look()
         return now
+
+    def alike(self, other: Writes) -> bool:
+        """Return whether tensors had the shapes that they had at another time."""
+        return self._shapes == other._shapes
 
     def none(self) -> bool:
         """Return whether nothing was written since."""
         return (
             [*map(Tensor.data_ptr, self._placed)] == self._addresses  # first: memory may have been given back
             and self._contents == self._views
-            and (not self._counted or [*map(_VERSION, self._counted)] == self._versions)
+            and [*map(_VERSION, self._counted)] == self._versions
             and (not self._samples or [*map(_BYTES, self._samples)] == self._parts)
         )
 
