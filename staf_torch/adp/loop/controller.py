@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from ...lanes.dependencies.lookups import is_users
-from ...lanes.dependencies.tensor_writes import version
+from ...lanes.dependencies.tensor_writes import Writes
 from ...lanes.gradients import gradients_of, marked
 from ...lanes.per_row.objects import OfRows
 from ...lanes.row_numbers import over_rows
@@ -145,10 +145,11 @@ class Feedback(Controller):
         if not is_users(type(self.policy)):
             return
         before = _tensors_of(self.policy)
+        writes = {name: Writes((tensor,)) for name, tensor in before.items()}
         with torch.no_grad():
             over_rows(self.policy, x0)
-        for name, (tensor, written) in _tensors_of(self.policy).items():
-            if name not in before or tensor is not before[name][0] or written != before[name][1]:
+        for name, tensor in _tensors_of(self.policy).items():
+            if name not in before or tensor is not before[name] or not writes[name].none():
                 raise ValueError(
                     f"`Feedback(policy=...)` must be a function of the state; a call of {self.label} changed "
                     f"its `{name}`. Write a policy with a memory as a `Controller`, with `init` and `step`."
@@ -158,10 +159,10 @@ class Feedback(Controller):
         return None if self._value is None else self._value(x)
 
 
-def _tensors_of(policy: Any) -> dict[str, tuple[Tensor, int]]:
-    """The tensors that an object holds itself, and how often each was written to."""
+def _tensors_of(policy: Any) -> dict[str, Tensor]:
+    """Return the tensors that an object holds itself."""
     held = {**getattr(policy, "__dict__", {}), **getattr(policy, "_buffers", {})}
-    return {name: (x, version(x)) for name, x in held.items() if isinstance(x, Tensor)}
+    return {name: x for name, x in held.items() if isinstance(x, Tensor)}
 
 
 class ControllerOfKinds(Controller):

@@ -155,7 +155,9 @@ class one_precision:  # noqa: N801
 def uncast() -> AbstractContextManager[object]:
     """Return a context in which `torch.autocast` is off."""
     kinds = [kind for kind in ("cpu", "cuda") if torch.is_autocast_enabled(kind)]
-    return _off(kinds) if kinds else nullcontext()
+    if len(kinds) > 1:
+        return _off(kinds)
+    return torch.autocast(kinds[0], enabled=False) if kinds else nullcontext()  # torch's compiler reads it
 
 
 @contextmanager

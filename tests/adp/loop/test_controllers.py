@@ -125,28 +125,30 @@ def test_a_feedback_has_the_name_the_period_and_the_value_of_its_policy() -> Non
 
 
 class Integral(nn.Module):
-    def __init__(self, in_place: bool, buffer: bool) -> None:
+    def __init__(self, way: str, buffer: bool) -> None:
         super().__init__()
         zero = torch.zeros(3, 1, dtype=torch.float64)
         if buffer:
             self.register_buffer("total", zero)
         else:
             self.total = zero
-        self.in_place, self.calls = in_place, 0
+        self.way, self.calls = way, 0
 
     def forward(self, x: Tensor) -> Tensor:
         self.calls += 1
-        if self.in_place:
+        if self.way == "in place":
             self.total += 0.01 * x[:, :1]
+        elif self.way == ".data":
+            self.total.data.add_(0.01 * x[:, :1])
         else:
             self.total = self.total + 0.01 * x[:, :1]
         return -3 * x[:, 1:] - self.total
 
 
 @pytest.mark.parametrize("buffer", [False, True])
-@pytest.mark.parametrize("in_place", [False, True])
-def test_a_policy_with_a_memory_is_refused(in_place: bool, buffer: bool) -> None:
-    policy = adp.Feedback(Integral(in_place, buffer))
+@pytest.mark.parametrize("way", ["another tensor", "in place", ".data"])
+def test_a_policy_with_a_memory_is_refused(way: str, buffer: bool) -> None:
+    policy = adp.Feedback(Integral(way, buffer))
     with pytest.raises(ValueError, match=r"changed its `total`.*as a `Controller`"):
         adp.simulate(policy, TWO_STATE, COST, X0, dt=0.01, steps=6, compile=False)
 
