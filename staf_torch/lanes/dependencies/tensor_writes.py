@@ -55,8 +55,8 @@ class Writes:
                 continue
             size = tensor.element_size() * (1 + sum(map(_reach, tensor.shape, tensor.stride())))
             begin = tensor.element_size() * tensor.storage_offset()
-            there = int(tensor.untyped_storage().nbytes()) - begin  # a storage may have been cut off
-            size = max(0, min(size, there))
+            there = tensor.untyped_storage().nbytes() - begin  # a storage may have been cut off
+            size = int(max(0, min(size, there)))
             memory = memoryview((ctypes.c_char * size).from_address(address))
             if size <= _SMALL or tensor.is_inference():
                 self._views.append(memory)
