@@ -117,7 +117,8 @@ def library(name: str, text: str, options: tuple[str, ...], folder: Path) -> Pat
     for path in found(file):
         if _is_whole(path):
             return path
-    takes = 1 + lines / 1600 if name == "lanes" else 10  # the others' templates are in headers
+    templates = name != "lanes" and '#include "' in text  # of a file, in its headers
+    takes = 10 if templates else 1 + lines / 1600
     sign = Sign(f"compiling {lines} lines, once: some {takes:.0f} s of a processor")
     # In a folder of its own first: another process may be building the same.
     path = cache() / file
