@@ -467,6 +467,7 @@ SPILLING = {
     "M = 15 Nesterov": "1 % of the 52 kB that a step moves; with shared memory 192 bytes remain",
     "M = 15 HeavyBall": "1 % of the 52 kB that a step moves; with shared memory 296 bytes remain",
     "M = 15 RecursiveLeastSquares": "72 bytes of 18 kB: its matrices of 225 numbers lie there",
+    "loop with rbf_grid basis": "504 bytes beside 5.3 kB of matrices; with shared memory 268 to 432 remain",
     "M = 6 RecursiveLeastSquares": "20 kB a step; 252 kB with its matrices of 36 numbers in arrays",
 }
 """Kernels of float64 that spill, and why no other form is taken: counted in their machine code for sm_90."""
