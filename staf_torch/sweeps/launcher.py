@@ -183,6 +183,13 @@ class Launch:
             raise ValueError(
                 "`sweep.records=table` needs all jobs at once: hydra/sweeper=basic without max_batch_size."
             )
+
+    def begin(self) -> None:
+        """Open the log of the sweep, and refuse a directory that has records of the other kind.
+
+        Raises:
+            ValueError: if it has.
+        """
         self._jobs.start()
         if not PRINTS.get():
             silence_terminal()

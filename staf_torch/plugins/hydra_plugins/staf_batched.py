@@ -67,6 +67,7 @@ class BatchedLauncher(launcher.Launcher):
         from staf_torch.sweeps.launcher import Launch
 
         launch = Launch(self)
+        launch.begin()
         if launch.in_table:
             launch.fill_table(job_overrides)
             return ()
