@@ -147,11 +147,8 @@ def measured(
         (True, True, 5, (6,), (3, 4, 5)),
         (False, True, 12, (6,), (1, 3)),
         (True, False, 5, (6,), (2,)),
-        (True, False, 5, (6,), ()),
         (True, True, 1, (2, 1, 3), (3, 4, 5)),
         (True, True, 1, (2, 1, 3), (1, 3)),
-        (False, True, 5, (4, 2), (1, 3)),
-        (False, True, 5, (4, 2), (2,)),
     ],
 )
 def test_metrics_of_members_are_those_of_a_loop_over_rows_and_times(
