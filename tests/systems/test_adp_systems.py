@@ -59,17 +59,6 @@ def test_known_optimal_value_solves_the_hjb_equation(name: str) -> None:
     assert residual.abs().max() < 1e-11
 
 
-def test_printed_plant_does_not_solve_the_hjb_equation_and_is_stable_without_control() -> None:
-    printed, right = systems.TwoState(as_printed=True), systems.TwoState()
-    cost = unit_cost(right)
-    grid = torch.cartesian_prod(*[torch.linspace(-2, 2, 41, dtype=torch.float64)] * 2)
-    residual = adp.hjb_residual(printed, cost, lambda x: right.optimal_value(x, cost.q, cost.r), grid)
-    # x2^2 (2 (cos 2 x1 + 2)^2 - 1), largest at (0, 2)
-    assert float(residual.abs().max()) == pytest.approx(68.0, rel=1e-12)
-    assert torch.linalg.eigvals(printed.linearisation().matrix).real.max() < 0
-    assert torch.linalg.eigvals(right.linearisation().matrix).real.max() > 0
-
-
 def test_plant_that_does_not_rest_at_the_origin_is_refused() -> None:
     class Pushed(systems.VanDerPol):
         def drift(self, x: Tensor) -> Tensor:

@@ -19,10 +19,6 @@ def drawn(*shape: int, seed: int = 0) -> Tensor:
     return torch.rand(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
-def numbers(values: object) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64)
-
-
 def chain() -> systems.Barrier:
     return systems.Barrier(systems.TwoStateChain(), LOW, HIGH)
 
@@ -37,10 +33,10 @@ class Offset(systems.ControlAffineSystem):
         self.bounds = systems.Bounds(-9.0, 9.0, 1)
 
     def equilibrium(self) -> Tensor:
-        return numbers([1.0, -2.0])
+        return tensor([1.0, -2.0])
 
     def resting_input(self) -> Tensor:
-        return numbers([3.0])
+        return tensor([3.0])
 
     def drift(self, x: Tensor) -> Tensor:
         return torch.stack((x[..., 1] + 2, (x[..., 0] - 1).sin() - 3 * (1 + (x[..., 1] + 2) / 2)), dim=-1)
@@ -63,7 +59,7 @@ def exact(x: float, low: float, high: float, center: float) -> float:
 def test_s_has_all_digits_next_to_a_wall_and_next_to_the_middle(gap: float) -> None:
     plant = chain()
     for x in ([-7 + gap, 7 - gap], [5 - gap, -5 + gap], [gap, -gap]):
-        s = plant.transform(numbers(x))
+        s = plant.transform(tensor(x))
         for k in range(2):
             assert float(s[k]) == pytest.approx(exact(x[k], LOW[k], HIGH[k], 0.0), rel=4e-16 * 4)
 
@@ -71,7 +67,7 @@ def test_s_has_all_digits_next_to_a_wall_and_next_to_the_middle(gap: float) -> N
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_there_and_back_in_random_boxes(dtype: torch.dtype) -> None:
     eps = torch.finfo(dtype).eps
-    for seed in range(20):
+    for seed in range(6):
         walls = 10 ** (3 * drawn(2, 3, seed=seed) - 1)
         plant = systems.Barrier(systems.Linear(-torch.eye(3), torch.eye(3)), -walls[0], walls[1])
         share = torch.cat((drawn(200, 3, seed=seed), 10 ** (-5 * drawn(200, 3, seed=seed + 50))))
@@ -104,9 +100,9 @@ def test_what_a_plant_declares_is_carried_through() -> None:
     assert plant.bounds is not None
     assert plant.periodic == ()  # the angle has walls: s of it does not repeat
     assert systems.Barrier(Offset(), [None, -3.0], [None, -1.0]).periodic == (0,)
-    assert torch.equal(plant.transform(numbers([1.0, -2.0])), torch.zeros(2).double())
-    around = plant.transform(numbers([0.5 + 2 * math.pi, -2.0]))
-    torch.testing.assert_close(around, plant.transform(numbers([0.5, -2.0])), rtol=1e-14, atol=0)
+    assert torch.equal(plant.transform(tensor([1.0, -2.0])), torch.zeros(2).double())
+    around = plant.transform(tensor([0.5 + 2 * math.pi, -2.0]))
+    torch.testing.assert_close(around, plant.transform(tensor([0.5, -2.0])), rtol=1e-14, atol=0)
     found = plant.linearisation()
     by_hand = torch.func.jacrev(lambda s: plant.rate(s, plant.resting_input()))(plant.equilibrium())
     torch.testing.assert_close(found.matrix, by_hand, rtol=1e-12, atol=1e-12)
@@ -116,7 +112,7 @@ def test_what_a_plant_declares_is_carried_through() -> None:
 def test_a_cost_of_x_is_a_cost_with_an_output() -> None:
     plant = chain()
     of_x = adp.QuadraticCost(2.0, 1.0, dim=2, inputs=1, output=plant.inverse)
-    s = plant.transform(numbers([[-6.0, 6.0]]))
+    s = plant.transform(tensor([[-6.0, 6.0]]))
     assert float(of_x.state_rate(s)) == pytest.approx(2 * 72.0, rel=1e-12)
     k = adp.LQR(plant, of_x).k
     inner = adp.LQR(plant.plant, adp.QuadraticCost(2.0, 1.0, dim=2, inputs=1)).k
@@ -142,7 +138,7 @@ def followed(
 
 def test_published_two_states_under_the_lqr_in_s() -> None:
     plant, cost = chain(), adp.QuadraticCost(10.0, 0.1, dim=2, inputs=1)
-    s0 = plant.transform(numbers([-6.5, 6.5]))
+    s0 = plant.transform(tensor([-6.5, 6.5]))
     assert s0.tolist() == pytest.approx([-3.472, 3.472], abs=5e-4)
     assert float(adp.LQR(plant, cost)(s0)) == pytest.approx(-22.0, abs=1e-3)  # the largest on the way
     first, paid = followed(plant, cost, s0, 0.004, 50)
@@ -175,20 +171,20 @@ def test_published_robot_under_the_lqr_in_s() -> None:
         u = [-math.fsum(k * e for k, e in zip(row, s, strict=True)) for row in gains]
         return [*robot_rate(x, u), math.fsum(e * e for e in (*s, *u))]
 
-    z, h = [-5.0, -5.0, 5.0, 5.0, 0.0], 0.01
-    for _ in range(6000):
+    z, h = [-5.0, -5.0, 5.0, 5.0, 0.0], 0.02
+    for _ in range(3000):
         k1 = field(z)
         k2 = field([y + 0.5 * h * k for y, k in zip(z, k1, strict=True)])
         k3 = field([y + 0.5 * h * k for y, k in zip(z, k2, strict=True)])
         k4 = field([y + h * k for y, k in zip(z, k3, strict=True)])
         z = [y + h / 6 * (a + 2 * b + 2 * c + d) for y, a, b, c, d in zip(z, k1, k2, k3, k4, strict=True)]
     assert z[4] == pytest.approx(63.12, abs=0.005)
-    assert float(plant.transform(numbers(z[:4]))[0]) == pytest.approx(-0.215, abs=5e-4)
+    assert float(plant.transform(tensor(z[:4]))[0]) == pytest.approx(-0.215, abs=5e-4)
 
 
 def test_a_held_control_moves_s_as_runge_kutta_in_s_does() -> None:
     plant, cost = chain(), adp.QuadraticCost(10.0, 0.1, dim=2, inputs=1)
-    s0 = plant.transform(numbers([[-6.5, 6.5], [1.0, 2.0]]))
+    s0 = plant.transform(tensor([[-6.5, 6.5], [1.0, 2.0]]))
     lqr = adp.LQR(plant, cost)
     run = adp.simulate(adp.Feedback(lqr), plant, cost, s0, dt=2e-4, steps=1)
     torch.testing.assert_close(
@@ -203,8 +199,8 @@ def test_a_held_control_moves_s_as_runge_kutta_in_s_does() -> None:
 def test_a_millionth_from_the_wall_nobody_who_can_brake_leaves(dtype: torch.dtype) -> None:
     """Speed has a wall of its own; where x1 is, there is room to brake or it moves inward."""
     plant, cost = chain(), adp.QuadraticCost(10.0, 0.1, dim=2, inputs=1)
-    x = torch.stack((-6.0 + 9.0 * drawn(300), numbers([7 - 1e-6, -5 + 1e-6] * 150)), dim=-1)
-    inward = numbers([[5 - 1e-6, -3.0], [-7 + 1e-6, 5.0], [5 - 1e-6, -1e-3]])
+    x = torch.stack((-6.0 + 9.0 * drawn(300), tensor([7 - 1e-6, -5 + 1e-6] * 150)), dim=-1)
+    inward = tensor([[5 - 1e-6, -3.0], [-7 + 1e-6, 5.0], [5 - 1e-6, -1e-3]])
     s0 = plant.transform(torch.cat((x, inward))).to(dtype)
     assert float(plant.margin(s0).max()) == pytest.approx(1e-6, rel=1e-5)
     run = adp.simulate(adp.Feedback(adp.LQR(plant, cost)), plant, cost, s0, dt=1e-3, steps=80, every=10)
@@ -215,11 +211,9 @@ def test_a_millionth_from_the_wall_nobody_who_can_brake_leaves(dtype: torch.dtyp
 @pytest.mark.parametrize(
     ("low", "high", "message"),
     [
-        ([0.0, -5.0], 5.0, r"`Barrier\(low=...\)` must be below the equilibrium \[0.0, 0.0\]"),
         (-5.0, [5.0, -1.0], r"`Barrier\(high=...\)` must be above the equilibrium"),
         ([-5.0], 5.0, r"one for each of the 2 states; got \[-5.0\]"),
         (-5.0, math.nan, "must be finite or inf; got nan"),
-        (["a", 0], 5.0, "must be numbers or None"),
     ],
 )
 def test_boxes_that_do_not_contain_the_equilibrium_are_refused(
@@ -233,20 +227,8 @@ def test_a_robot_is_that_of_scalars_and_one_that_no_mass_matrix_has_is_refused()
     with pytest.raises(ValueError, match=r"`TwoLinkRobot\(inertia=...\)` must be positive"):
         systems.TwoLinkRobot(inertia=[0.3, 0.196, 0.242])
     robot, x, u = systems.TwoLinkRobot(), 2 * drawn(20, 4) - 1, drawn(20, 2)
-    expected = numbers([robot_rate(*row) for row in zip(x.tolist(), u.tolist(), strict=True)])
+    expected = tensor([robot_rate(*row) for row in zip(x.tolist(), u.tolist(), strict=True)])
     torch.testing.assert_close(robot.rate(x, u), expected, rtol=1e-12, atol=1e-12)
-
-
-def test_an_angle_with_walls_has_the_same_coordinate_a_turn_further_on() -> None:
-    pendulum = systems.Pendulum()
-    pendulum.periodic = (0,)
-    box = systems.Barrier(pendulum, low=[-0.5, None], high=[2.0, None])
-    x = torch.stack((uniform(20, seed=1, low=-0.4, high=1.9), uniform(20, seed=2)), dim=-1)
-    turn = torch.tensor([2 * math.pi, 0.0], dtype=torch.float64)
-    for of in (box.transform, box.coordinates):
-        torch.testing.assert_close(of(x + turn), of(x), rtol=1e-9, atol=1e-9)
-        torch.testing.assert_close(of(x - 2 * turn), of(x), rtol=1e-9, atol=1e-9)
-        torch.testing.assert_close(box.inverse(of(x + turn)), x, rtol=1e-9, atol=1e-9)
 
 
 INF = math.inf

@@ -27,57 +27,40 @@ def with_torch(x: Tensor, u: Tensor) -> Tensor:
     return x @ torch.from_numpy(A).mT + u @ torch.from_numpy(B).mT
 
 
-class Asked:
-    """Keeps what it was called with, and refuses tensors."""
-
-    def __init__(self) -> None:
-        self.calls: list[tuple[np.ndarray, np.ndarray]] = []
-
-    def __call__(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        if isinstance(x, Tensor):
-            raise TypeError("no tensors")
-        self.calls.append((x.copy(), u.copy()))
-        return linear(x, u)
+def of_arrays(x: Any, u: Any) -> Any:
+    if isinstance(x, Tensor):
+        raise TypeError("no tensors")
+    return linear(x, u)
 
 
-@pytest.mark.parametrize("function", [linear, with_torch])
+@pytest.mark.parametrize("function", [of_arrays, with_torch])
 def test_leading_dimensions_of_state_and_input_are_broadcast(function: Any) -> None:
-    box = BlackBox("T", function if function is with_torch else Asked(), ZERO, NONE)
-    for lead in ((), (4,), (3, 4)):
-        for other in ((), (4,), (1, 4)):
-            x, u = uniform(*lead, 2, seed=1), uniform(*other, 1, seed=2)
-            found = box(x, u)
-            wanted = x @ torch.from_numpy(A).mT + u @ torch.from_numpy(B).mT
-            assert found.shape == wanted.shape
-            torch.testing.assert_close(found, wanted)
-    single = box(uniform(4, 2).float(), uniform(4, 1).float()) if function is linear else None
-    assert single is None or single.dtype == torch.float32
+    box = BlackBox("T", function, ZERO, NONE)
+    for lead, other in (((), ()), ((4,), ()), ((), (4,)), ((3, 4), (1, 4))):
+        x, u = uniform(*lead, 2, seed=1), uniform(*other, 1, seed=2)
+        torch.testing.assert_close(box(x, u), with_torch(x, u))
 
 
 def test_slopes_are_those_of_the_function_or_known() -> None:
-    for box in (BlackBox("T", with_torch, ZERO, NONE), BlackBox("T", Asked(), ZERO, NONE)):
+    for box in (BlackBox("T", with_torch, ZERO, NONE), BlackBox("T", of_arrays, ZERO, NONE)):
         at = box.linearisation(tensor([3.0, -1.0]), tensor([0.5]))
         torch.testing.assert_close(at.matrix, tensor(A), rtol=0, atol=1e-8)
         torch.testing.assert_close(at.input_matrix, tensor(B), rtol=0, atol=1e-8)
         assert not at.matrix.requires_grad
-    seen: list[Any] = []
 
     def slopes(x: np.ndarray, u: np.ndarray) -> tuple[Any, Any]:
-        seen.append((x, u))
+        assert (x.tolist(), u.tolist()) == ([3.0, -1.0], [0.5])
         return A.tolist(), B.tolist()
 
     known = BlackBox("T", linear, ZERO, NONE, slopes).linearisation(tensor([3.0, -1.0]), tensor([0.5]))
     assert known.matrix.dtype == known.input_matrix.dtype == torch.float64
     assert known.matrix.tolist() == A.tolist()
-    assert (seen[0][0].tolist(), seen[0][1].tolist()) == ([3.0, -1.0], [0.5])
-    for spoiled in ((A * np.nan, B), (A, B * np.inf)):
-        box = BlackBox("T", linear, ZERO, NONE, lambda x, u, s=spoiled: s)  # type: ignore[misc]
-        with pytest.raises(ValueError, match=r"the `slopes` of `T` are not finite at the state \[0.0, 0.0\]"):
-            box.linearisation(ZERO, NONE)
-    for wrong in ((A[:1], B), (A, B.T), (A, np.ones((2, 2)))):
-        box = BlackBox("T", linear, ZERO, NONE, lambda x, u, s=wrong: s)  # type: ignore[misc]
-        with pytest.raises(ValueError, match=r"must have the shapes \(2, 2\) and \(2, 1\); got \("):
-            box.linearisation(ZERO, NONE)
+    box = BlackBox("T", linear, ZERO, NONE, lambda x, u: (A, B * np.inf))
+    with pytest.raises(ValueError, match=r"the `slopes` of `T` are not finite at the state \[0.0, 0.0\]"):
+        box.linearisation(ZERO, NONE)
+    box = BlackBox("T", linear, ZERO, NONE, lambda x, u: (A, B.T))
+    with pytest.raises(ValueError, match=r"must have the shapes \(2, 2\) and \(2, 1\); got \("):
+        box.linearisation(ZERO, NONE)
 
 
 @pytest.mark.parametrize(("bend", "smooth"), [(0.115, True), (0.125, False)])
@@ -101,7 +84,6 @@ def test_a_kink_of_a_twentieth_of_the_largest_slope_is_one(bend: float, smooth: 
 @pytest.mark.parametrize(
     ("function", "message"),
     [
-        (None, r"`T\(f\)` must be a function of x \(B, n\) and u \(B, m\); got None"),
         (
             lambda x, u: [1.0],
             r"must map x and u of the shapes \(10, 2\) and \(10, 1\) to \(10, 2\); got \(1,\)",
@@ -110,7 +92,6 @@ def test_a_kink_of_a_twentieth_of_the_largest_slope_is_one(bend: float, smooth: 
             lambda x, u: 1 / 0,
             r"raised ZeroDivisionError \(division by zero\) at x and u of the shapes \(5, 2\)",
         ),
-        (lambda x, u: (_ for _ in ()).throw(KeyError()), r"raised KeyError \(\)"),
         (lambda x, u: x + np.inf * u, r"not finite near x = \[0.0, 0.0\]"),
         (lambda x, u: 2 * x, r"`T\(f\)` ignores u: another input changes nothing near x = \[0.0, 0.0\]"),
     ],
