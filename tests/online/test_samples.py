@@ -41,6 +41,20 @@ def test_numbers_of_any_kind_are_samples(value: Any) -> None:
         model.predict(torch.ones(2, device="meta"))
 
 
+@over(REGRESSORS, "kind")
+def test_samples_in_single_precision_are_the_same_stream(kind: str) -> None:
+    draw = torch.Generator().manual_seed(3)
+    x = torch.randn(60, 3, 2, generator=draw).cumsum(0) / 10
+    y, single, double = x.sum(-1).sin(), REGRESSORS[kind](), REGRESSORS[kind]()
+    for a, b in zip(x, y, strict=True):  # as they lie in memory, one by one
+        single.partial_fit(a, b)
+        double.partial_fit(a.double(), b.double())
+    found = single.predict(x[-1] + 0.05)
+    assert found.dtype == torch.float32
+    close = {"rtol": 0, "atol": 2e-2, "check_dtype": False}
+    torch.testing.assert_close(found, double.predict(x[-1].double() + 0.05), **close)
+
+
 class Sparse:
     """What has `toarray` is sparse."""
 
