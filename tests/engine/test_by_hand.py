@@ -185,10 +185,11 @@ PAIRS = [
 ]
 
 
+@pytest.mark.parametrize("way", ["definition", "by steps"])
 @pytest.mark.parametrize(("name", "predictor"), PAIRS)
-def test_a_chase_is_what_its_equations_say(name: str, predictor: str, run: Callable[..., Any]) -> None:
+def test_a_chase_is_what_its_equations_say(name: str, predictor: str, way: str) -> None:
     basis = BASES[name]
-    result = run(
+    result = WAYS[way](
         STATES,
         basis,
         Paper(),
@@ -280,17 +281,15 @@ def test_every_way_of_a_chase_finds_the_same(name: str, law: str) -> None:
     torch.testing.assert_close(last.weights, whole.weights[:, -1:], rtol=1e-8, atol=1e-10)
 
 
-@pytest.mark.parametrize("run_all", [True, False])
-def test_a_reach_beyond_one_is_warned_of_once_in_however_many_pieces(run_all: bool) -> None:
+def test_a_reach_beyond_one_is_warned_of_once_in_however_many_pieces() -> None:
     """Also where the first piece has none, and by a state that is not the last."""
     basis = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(st.rings(3), 0.5))
     states = 0.5 * circles(2, 12)
     states[1, 5] *= 6.0  # |x| r = 1.2 or so
     states[0, 9] *= 9.0
     worst = [float(0.5 * states[:, at].norm(dim=-1).max()) for at in (slice(4, 8), slice(8, 12))]
-    chased: Callable[..., Any] = (lambda *given: list(chase_pieces(*given))) if run_all else chase_weights
     with pytest.warns(UserWarning, match=f"r = {worst[0]:.3g} > 1.*Shrink the radius") as seen:
-        chased(states.split(4, dim=1), basis, Paper(), LAW)
+        chase_weights(states.split(4, dim=1), basis, Paper(), LAW)
     assert len(seen) == 1
     assert worst[1] > 1
     chase(0.4 * states[:1, :4], basis, Paper(), LAW)  # nothing to say
@@ -336,16 +335,3 @@ def test_zero_weights_are_zero_also_where_their_unit_overflows() -> None:
     assert one.coefficients.isfinite().all()
     some = chase(far, basis, Paper(), LAW, weights=tensor([0.0, 1.0, 0.0]), inner_steps=0)
     assert some.diverged_at.tolist() == [0]
-
-
-class Nothing(predictors.Predictor):
-    def predict(self, inputs: Any, weights: Tensor, previous: Tensor, unit: Tensor) -> Tensor:
-        assert inputs == ()
-        return weights * unit
-
-
-def test_a_predictor_that_keeps_the_weights_is_none() -> None:
-    plain, same = (
-        chase(STATES, BASES["exponential"], Paper(), LAW, predictor=p).weights for p in (None, Nothing())
-    )
-    torch.testing.assert_close(same, plain, rtol=1e-12, atol=1e-12)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 
 import pytest
 import torch
 from helpers_laws import TARGET, basis, states
-from variants import LAWS, PREDICTORS, RATED, SMOOTH_KERNELS, SYSTEMS, by_turns
+from variants import LAWS, PREDICTORS, RATED, SMOOTH_KERNELS, SYSTEMS
 
 from staf_torch import StaFBasis, StateFollowingCenters, StateRadius, chase, optim, rings, theory
 from staf_torch.engine import ChaseResult
@@ -18,7 +19,7 @@ def certified(
     law: str, steps: int, *, kernel: str = "exponential", system: str = "oscillator", predictor: str = "none"
 ) -> ChaseResult:
     return chase(
-        states(batch=2, steps=50, dt=0.02, system=system),
+        states(batch=2, steps=30, dt=0.02, system=system),
         basis(SMOOTH_KERNELS[kernel].make()),
         TARGET,
         LAWS[law],
@@ -28,39 +29,22 @@ def certified(
     )
 
 
-# Every kernel with a law and a system in their turn.
+TURNS = zip(*map(itertools.cycle, (RATED, SMOOTH_KERNELS, SYSTEMS, PREDICTORS)), strict=True)
+
+
 @pytest.mark.parametrize(
-    ("law", "steps", "kernel", "system"),
-    [
-        (
-            *(("steepest descent", 10), ("fixed step", 3), ("conjugate gradient", 2))[k // 3 % 3],
-            kernel,
-            system,
-        )
-        for k, kernel in enumerate(SMOOTH_KERNELS)
-        for s, system in enumerate(SYSTEMS)
-        if (k + s) % 3 == 0
-    ],
+    ("law", "kernel", "system", "predictor"), [*itertools.islice(TURNS, len(SMOOTH_KERNELS))]
 )
-def test_the_one_step_bound_holds_on_every_system_and_kernel(
-    law: str, steps: int, kernel: str, system: str
+def test_the_one_step_bound_holds_on_every_system_and_kernel_by_every_law_with_a_rate_and_every_predictor(
+    law: str, kernel: str, system: str, predictor: str
 ) -> None:
-    result = certified(law, steps, kernel=kernel, system=system)
+    result = certified(law, 3, kernel=kernel, system=system, predictor=predictor)
     certificate = result.certificate
     assert certificate is not None
     assert not bool(certificate.violated.any())
     assert bool(certificate.bound.isfinite().all())
     rounding = 1e-5 * result.value.abs().amax(1, keepdim=True)
     assert bool((result.excess.clamp(min=0).sqrt() <= certificate.bound * (1 + 1e-9) + rounding).all())
-
-
-@pytest.mark.parametrize(("predictor", "law"), by_turns(PREDICTORS, list(RATED)))
-def test_the_one_step_bound_holds_for_every_law_with_a_rate_and_every_predictor(
-    predictor: str, law: str
-) -> None:
-    certificate = certified(law, 2, predictor=predictor).certificate
-    assert certificate is not None
-    assert not bool(certificate.violated.any())
 
 
 def test_the_one_step_bound_is_tight_for_the_papers_law() -> None:
@@ -95,34 +79,29 @@ def test_the_norm_of_a_translation_invariant_kernel_does_not_change() -> None:
     torch.testing.assert_close(certificate.growth, torch.ones_like(certificate.growth))
 
 
-def test_a_chase_is_not_certified_unless_asked() -> None:
-    assert chase(states(), basis(), TARGET, optim.Exact()).certificate is None
-
-
-# Each kernel on one system, and every system under both kinds of radius.
+# Every system under both kinds of radius, each with another kernel.
 @pytest.mark.parametrize(
     ("kernel", "system", "shrinking"),
     [
         (kernel, list(SYSTEMS)[k % len(SYSTEMS)], bool(k // len(SYSTEMS) % 2))
         for k, kernel in enumerate(SMOOTH_KERNELS)
+        if k % 2 == 0
     ],
 )
-def test_the_a_priori_radius_holds_on_every_system_and_kernel(
-    kernel: str, system: str, shrinking: bool
-) -> None:
+def test_the_a_priori_radius_holds_on_every_system(kernel: str, system: str, shrinking: bool) -> None:
     dt, steps, law = 0.02, 15, optim.SteepestDescent()
     radius = StateRadius(0.3, 0.5) if shrinking else 0.2
     local = StaFBasis(SMOOTH_KERNELS[kernel].make(), StateFollowingCenters(rings(3), radius))
-    x = states(batch=2, steps=90, dt=dt, system=system)
+    x = states(batch=2, steps=60, dt=dt, system=system)
     constants = theory.drift_constants(local, TARGET, x, SYSTEMS[system]().drift(x))
     bound = theory.ultimate_bound(constants, law, dt=dt, inner_steps=steps)
     assert math.isfinite(bound.before)
     result = chase(x, local, TARGET, law, inner_steps=steps)
     q = float(law.contraction(torch.tensor(constants.condition_number))) ** (steps / 2)
-    left = float(result.excess_before[:, 0].max().sqrt()) * (q * math.exp(constants.growth * dt)) ** 60
+    left = float(result.excess_before[:, 0].max().sqrt()) * (q * math.exp(constants.growth * dt)) ** 40
     sampling = 1.02  # the constants are taken at the states alone, not between them
-    assert float(result.excess_before[:, 60:].max().sqrt()) <= sampling * math.sqrt(bound.before) + left
-    assert float(result.excess[:, 60:].max().sqrt()) <= sampling * math.sqrt(bound.after) + left
+    assert float(result.excess_before[:, 40:].max().sqrt()) <= sampling * math.sqrt(bound.before) + left
+    assert float(result.excess[:, 40:].max().sqrt()) <= sampling * math.sqrt(bound.after) + left
 
 
 @functools.cache
@@ -143,8 +122,7 @@ def test_the_a_priori_radius_of_the_papers_simulation() -> None:
     assert whole.after == 0
 
 
-@pytest.mark.parametrize("before", [False, True])
-@pytest.mark.parametrize("excess", [0.35, 0.01])
+@pytest.mark.parametrize(("before", "excess"), [(False, 0.35), (True, 0.01)])
 def test_the_inverses_of_the_a_priori_radius_are_its_inverses(before: bool, excess: float) -> None:
     _, constants = circle()
     law = optim.SteepestDescent()
@@ -177,24 +155,17 @@ def test_the_papers_own_step_is_four_orders_more_cautious() -> None:
     assert ours > 1e4 * step.dt
 
 
-def test_a_law_without_a_rate_has_no_a_priori_radius() -> None:
-    _, constants = circle()
-    with pytest.raises(ValueError, match=r"ultimate_bound\(law=\.\.\.\)"):
-        theory.ultimate_bound(constants, optim.HeavyBall(), dt=0.01, inner_steps=1)
-
-
-@pytest.mark.parametrize("unit", [1e-6])
-def test_rounding_is_no_violation_in_any_unit_of_the_value(unit: float) -> None:
-    where = states(batch=3, steps=1)[:, :1].expand(-1, 15, -1)  # at rest: the bound goes to zero
+def test_rounding_is_no_violation_in_any_unit_of_the_value() -> None:
+    where = states(batch=3, steps=1)[:, :1].expand(-1, 8, -1)  # at rest: the bound goes to zero
     plain, scaled = (
         chase(
             *(where, basis(), lambda x, u=u: u * TARGET(x), LAWS["steepest descent"]),
             inner_steps=100,
             certificate=True,
         ).certificate
-        for u in (1.0, unit)
+        for u in (1.0, 1e-6)
     )
     assert plain is not None
     assert scaled is not None
     assert not bool(scaled.violated.any())
-    torch.testing.assert_close(scaled.bound[:, 0], unit * plain.bound[:, 0], rtol=1e-4, atol=0)
+    torch.testing.assert_close(scaled.bound[:, 0], 1e-6 * plain.bound[:, 0], rtol=1e-4, atol=0)

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from helpers_chase import BASES, LAW, circles
@@ -34,10 +33,8 @@ from staf_torch.targets import Cosine, Paper
 
 pytestmark = [pytest.mark.compiled, pytest.mark.needs_compiler]
 
-TIMES = 20
-STATES = circles(9, TIMES)
+STATES = circles(9, 8)
 WELL = StaFBasis(ExponentialKernel(), StateFollowingCenters(rings(3), 0.6))
-MANY = StaFBasis(ExponentialKernel(), StateFollowingCenters(rings(15), 0.9))
 GAUSS = StaFBasis(GaussianKernel(0.8), StateFollowingCenters(rings(3), 0.7))
 MOVING, MATERN, POLYNOMIAL = (BASES[n] for n in ("exponential, moving radius", "matern", "polynomial"))
 # Every law, predictor, kind of basis; a program each.
@@ -109,15 +106,6 @@ def test_the_compiled_chase_is_the_definition(name: str, compiled: Callable[...,
     assert_close(*same, 1e-10)
 
 
-def test_a_certificate_is_compiled(compiled: Callable[..., Any]) -> None:
-    got = compiled(chase, STATES, WELL, Paper(), LAW, inner_steps=2, certificate=True)
-    want = definition(chase, STATES, WELL, Paper(), LAW, inner_steps=2, certificate=True)
-    assert got.certificate is not None
-    assert want.certificate is not None
-    for a, b in zip(got.certificate, want.certificate, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-8, atol=1e-9)
-
-
 def test_matrices_of_many_centers_are_factored_in_loops(compiled: Callable[..., Any]) -> None:
     """A certificate and a Kalman filter of the weights: factors that pivot, triangles, eigenvalues, matrices
     carried."""
@@ -140,7 +128,7 @@ STIFF = StaFBasis(ExponentialKernel(), StateFollowingCenters(rings(3), 0.05))
 def test_rows_have_the_bits_that_they_have_in_any_batch_and_beside_any_row(
     compiled: Callable[..., Any],
 ) -> None:
-    states = circles(300, 17)
+    states = circles(300, 12)
     whole = compiled(chase_weights, states, STIFF, Paper(), LAW).weights
     for first, batch in ((0, 1), (193, 7), (200, 64)):
         part = compiled(chase_weights, states[first : first + batch], STIFF, Paper(), LAW).weights
@@ -151,7 +139,7 @@ def test_rows_have_the_bits_that_they_have_in_any_batch_and_beside_any_row(
     others = [i for i in range(300) if i not in (5, 7)]
     assert torch.equal(result.weights[others], whole[others])
     assert result.diverged_at[[5, 7]].tolist() == [3, 9]
-    assert torch.equal(result.weights[5, 3:], whole[5, 2].expand(14, -1))
+    assert torch.equal(result.weights[5, 3:], whole[5, 2].expand(9, -1))
 
 
 def test_pieces_of_time_continue_to_the_bit_and_remember_who_diverged(compiled: Callable[..., Any]) -> None:
@@ -212,31 +200,19 @@ def user_target(x: Tensor) -> Tensor:
     return x[..., 0].square() + (x[..., 0] * x[..., 1]).tanh()
 
 
-def test_a_callable_that_cannot_be_compiled_is_said_once(caplog: pytest.LogCaptureFixture) -> None:
-    def reads_memory(x: Tensor) -> Tensor:
-        return torch.from_numpy(np.square(x.detach().numpy())).sum(-1)
-
-    for _ in range(2):
-        got = chase_weights(STATES, WELL, reads_memory, LAW, inner_steps=2)
-    assert_close(got, definition(chase_weights, STATES, WELL, reads_memory, LAW, inner_steps=2), 1e-12)
-    (line,) = caplog.messages
-    assert "numpy" in line
-
-
 class Scaled(Paper):
     def __init__(self, factor: Tensor) -> None:
         super().__init__()
-        self.factor = factor if isinstance(factor, nn.Parameter) else (factor,)[0]
+        self.factor = factor
 
     def forward(self, x: Tensor) -> Tensor:
         value: Tensor = self.factor * super().forward(x)
         return value
 
 
-@pytest.mark.parametrize(("run", "kind"), [(chase, nn.Parameter), (chase_weights, Tensor.requires_grad_)])
-def test_a_learned_target_keeps_its_gradient(run, kind) -> None:
-    factor = kind(torch.tensor(2.0, dtype=torch.float64))
-    result = run(STATES, GAUSS, Scaled(factor), LAW, inner_steps=2)
+def test_a_learned_target_keeps_its_gradient() -> None:
+    factor = nn.Parameter(torch.tensor(2.0, dtype=torch.float64))
+    result = chase_weights(STATES, GAUSS, Scaled(factor), LAW, inner_steps=2)
     (gradient,) = torch.autograd.grad(result.weights[:, -1].sum(), factor)
     # The chase is linear in V where the line searches are: they are invariant under its scale.
     want = result.weights[:, -1].sum() / 2
@@ -270,9 +246,6 @@ def test_a_law_of_a_user_may_carry_tensors_of_every_kind(compiled: Callable[...,
     wanted = definition(chase, STATES, WELL, Paper(), Adaptive(), inner_steps=3)
     torch.testing.assert_close(found.weights, wanted.weights, rtol=1e-9, atol=1e-9)
     assert bool((found.excess[:, -1] < found.excess[:, 0]).all())
-    for row in range(2):
-        alone = compiled(chase, STATES[row : row + 1], WELL, Paper(), Adaptive(), inner_steps=3).weights[0]
-        torch.testing.assert_close(alone, found.weights[row], rtol=1e-13, atol=1e-14)
 
 
 class Broken(UpdateLaw):
@@ -290,10 +263,8 @@ class Broken(UpdateLaw):
 @pytest.mark.parametrize(
     ("law", "message"),
     [
-        (Broken([]), r"`Broken.init` must return a tuple of tensors; got \[\]"),
         (Broken((0.5,)), r"`Broken.init` must return a tuple of tensors; got \(0.5,\)"),
         (Broken((torch.zeros(3),)), r"B = 9; number 0 is \(3,\)"),
-        (Broken((torch.tensor(0.5),)), r"B = 9; number 0 is \(\)"),
         (Broken((), torch.zeros(9, 4)), r"must return weights of the shape \(B, 3\); got \(9, 4\)"),
         (Broken((), None, (torch.zeros(9),)), r"must return a state of the shapes .* \[\]; got \[\(9,\)\]"),
     ],
@@ -310,10 +281,7 @@ class Distance(Kernel):
         return (-torch.cdist(x1, x2).square()).exp()
 
 
-def test_a_kernel_by_distances_is_compiled_and_its_tangent_refused(compiled: Callable[..., Any]) -> None:
+def test_a_tangent_of_a_kernel_by_distances_is_refused() -> None:
     basis = StaFBasis(Distance(), StateFollowingCenters(rings(3), 0.6))
-    found = compiled(chase_weights, STATES, basis, Paper(), LAW)
-    wanted = definition(chase_weights, STATES, basis, Paper(), LAW)
-    torch.testing.assert_close(found.weights, wanted.weights, rtol=1e-9, atol=1e-9)
     with pytest.raises(NotImplementedError, match=r"`Tangent` predictor needs derivatives .* forward mode"):
         chase(STATES, basis, Paper(), LAW, predictor=predictors.Tangent())

@@ -24,7 +24,12 @@ def excess_path(law: optim.UpdateLaw, objective: NativeError, steps: int) -> Ten
 def test_every_law_treats_each_row_of_a_batch_alone(name: str) -> None:
     objective = quadratic()
     together = iterate(LAWS[name], objective, torch.zeros_like(objective.values), 6)
-    for row in range(objective.values.shape[0]):
+    poisoned = changed(objective, values=objective.values.clone())
+    poisoned.values[3] = torch.nan
+    beside = iterate(LAWS[name], poisoned, torch.zeros_like(objective.values), 6)
+    others = [0, 1, 2, 4]
+    assert torch.equal(beside[:, others], together[:, others])
+    for row in (0, 4):
         known = Precomputed(*(None if f is None else f[row] for f in objective.precomputed))
         alone = NativeError(objective.gram[row], objective.values[row], known)
         path = iterate(LAWS[name], alone, torch.zeros_like(alone.values), 6)
@@ -81,16 +86,13 @@ def test_a_descent_law_never_raises_the_excess(name: str) -> None:
     assert bool((excess[1:] <= excess[:-1] * (1 + 1e-9) + 1e-20).all())
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 6])
+@pytest.mark.parametrize("count", [1, 6])
 def test_conjugate_gradients_are_exact_after_as_many_iterations_as_weights(count: int) -> None:
     excess = excess_path(optim.ConjugateGradient(), quadratic(count=count), count + 5)
     assert bool((excess[count:] < 1e-20 * excess[0]).all())
-
-
-@pytest.mark.parametrize("name", ["exact", "preconditioned by the core"])
-def test_an_exact_solve_takes_one_iteration(name: str) -> None:
-    excess = excess_path(LAWS[name], quadratic(), 1)
-    assert bool((excess[1] < 1e-24 * excess[0]).all())
+    for law in (optim.Exact(), optim.PreconditionedDescent("core")):
+        excess = excess_path(law, quadratic(count=count), 1)
+        assert bool((excess[1] < 1e-24 * excess[0]).all())
 
 
 def test_jacobi_takes_one_iteration_on_a_diagonal_gram_matrix() -> None:
@@ -102,7 +104,7 @@ def test_jacobi_takes_one_iteration_on_a_diagonal_gram_matrix() -> None:
 
 @pytest.mark.parametrize(("name", "power"), [("heavy ball", 2), ("nesterov", 1)])
 def test_momentum_converges_at_its_rate(name: str, power: int) -> None:
-    excess = excess_path(LAWS[name], quadratic(condition=400.0), 300)
+    excess = excess_path(LAWS[name], quadratic(condition=400.0), 150)
     q = 400.0**-0.5
     rate = ((1 - q) / (1 + q)) ** 2 if power == 2 else (1 - q)
     measured = (excess[150] / excess[50]) ** 0.01
@@ -114,7 +116,7 @@ def test_a_law_that_could_blow_up_stays_bounded_under_restarts(name: str) -> Non
     law, objective = LAWS[name], quadratic(condition=1e6)
     weights = torch.zeros_like(objective.values)
     none = objective.excess(weights, objective.minimiser())
-    for _ in range(60):  # two iterations from rest, over and over: plain heavy ball grows ninefold each time
+    for _ in range(25):  # two iterations from rest, over and over: plain heavy ball grows ninefold each time
         weights = iterate(law, objective, weights, 2)[-1]
     assert bool((objective.excess(weights, objective.minimiser()) < 100 * none).all())
 
@@ -126,17 +128,9 @@ def test_an_absolute_step_that_is_too_long_gives_way_to_the_line_search() -> Non
     torch.testing.assert_close(guarded, iterate(optim.SteepestDescent(), objective, zero, 3))
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_barzilai_borwein_never_ends_a_time_step_worse_than_it_began(seed: int) -> None:
-    excess = excess_path(optim.BarzilaiBorwein(), quadratic(condition=1e5, seed=seed), 60)
+def test_barzilai_borwein_never_ends_a_time_step_worse_than_it_began() -> None:
+    excess = excess_path(optim.BarzilaiBorwein(), quadratic(batch=20, condition=1e5), 60)
     assert bool((excess <= excess[0] * (1 + 1e-9)).all())
-
-
-def test_barzilai_borwein_outruns_steepest_descent() -> None:
-    objective = quadratic(batch=50, condition=1e3)
-    laws = optim.BarzilaiBorwein(), optim.SteepestDescent()
-    raydan, cauchy = (excess_path(law, objective, 60)[-1].median() for law in laws)
-    assert float(raydan) < 1e-2 * float(cauchy)
 
 
 def test_recursive_least_squares_is_the_batch_fit_to_all_samples() -> None:
@@ -201,23 +195,6 @@ def test_a_zero_quadratic_moves_nothing(name: str) -> None:
         weights, state = law.step(objective, weights, state)
         assert torch.equal(weights, zero)
         assert all(bool(part.isfinite().all()) for part in flatten(state)[0])  # for the steps to come
-
-
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda: optim.FixedStep(2.0),
-        lambda: optim.FixedStep(-1.0, relative=False),
-        lambda: optim.HeavyBall(4.0, 0.9),
-        lambda: optim.Nesterov(1.5),
-        lambda: optim.NormalisedLMS(2.0),
-        lambda: optim.SteepestDescent().with_step_size(1.0),
-    ],
-)
-def test_a_setting_that_would_diverge_is_refused(make: object) -> None:
-    assert callable(make)
-    with pytest.raises(ValueError, match=r"`.*`"):
-        make()
 
 
 @pytest.mark.parametrize("momentum", [0.0, 0.5, 0.9])

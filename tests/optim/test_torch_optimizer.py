@@ -11,7 +11,7 @@ import torch
 from helpers import random_positive_definite, uniform
 from helpers_laws import TARGET, basis, quadratic
 from torch import Tensor, nn
-from variants import LAWS
+from variants import LAWS, by_turns
 
 from staf_torch import optim
 from staf_torch.optim.objective import NativeError
@@ -25,8 +25,7 @@ def losses(objective: NativeError, weights: Tensor) -> Tensor:
     return torch.linalg.vecdot(weights, objective.curvature(weights) - 2 * objective.values)
 
 
-@pytest.mark.parametrize("name", USABLE)
-@pytest.mark.parametrize("summed", [True, False])
+@pytest.mark.parametrize(("name", "summed"), by_turns(USABLE, [True, False]))
 def test_a_step_is_the_step_of_the_law_on_the_staf_quadratic(name: str, summed: bool) -> None:
     law = USABLE[name]
     x = torch.tensor([[1.0, 0.0], [0.3, -0.8]], dtype=torch.float64)
@@ -40,7 +39,7 @@ def test_a_step_is_the_step_of_the_law_on_the_staf_quadratic(name: str, summed: 
 
     weights = torch.zeros(2, 3, dtype=torch.float64)
     state = law.init(weights)
-    for _ in range(4):
+    for _ in range(3):
         before = losses(objective, weights)
         loss = optimizer.step(closure)
         torch.testing.assert_close(loss, before.sum() if summed else before)
@@ -67,9 +66,7 @@ def test_it_works_beside_adam_on_the_other_parameters() -> None:
     assert bool((other < 1).all())
 
 
-@pytest.mark.parametrize(
-    "name", ["heavy ball", "recursive least squares", "barzilai-borwein", "steepest descent"]
-)
+@pytest.mark.parametrize("name", ["recursive least squares", "barzilai-borwein"])
 def test_a_run_goes_on_from_its_state_dict(name: str) -> None:
     objective = quadratic()
 
@@ -146,8 +143,7 @@ def test_what_it_cannot_use_is_refused_in_a_sentence() -> None:
         optimizer.step(backward)
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@pytest.mark.parametrize("shape", [(5, 3), (2, 3, 4)])
+@pytest.mark.parametrize(("shape", "dtype"), [((5, 3), torch.float64), ((2, 3, 4), torch.float32)])
 def test_rows_that_are_coupled_are_refused_with_the_curvature_between_them(
     shape: tuple[int, ...], dtype: torch.dtype
 ) -> None:
