@@ -238,7 +238,7 @@ class GlobalValue(KeptPrecision):
         seen = self.seen(x).cpu().numpy()  # the tree is the processor's
         if not np.isfinite(seen).all():
             seen = np.where(np.isfinite(seen), seen, 0.0)  # such a row finds no value, the others theirs
-        at = self._tree.query(seen, count)[1].reshape(len(x), -1)
+        at = self._tree.query(seen, count)[1].reshape(len(x), count)
         rows = self._rows.numpy()[at]
         if without is not None:
             own = rows // self.length == without.cpu().numpy()[:, None]
@@ -256,7 +256,7 @@ class GlobalValue(KeptPrecision):
         ]
         cost, control, covered = (torch.cat(part) for part in zip(*parts, strict=True))
         shape = entries.shape
-        return cost.view(shape), control.view(*shape, -1), covered.view(shape)
+        return cost.view(shape), control.view(*shape, control.shape[-1]), covered.view(shape)
 
     def _followed(self, x: Tensor, entries: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Cost (C, 1), first control (C, 1, m) and arrival (C, 1) of one candidate a row: (C, n), (C,)."""
