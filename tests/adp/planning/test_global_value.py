@@ -54,11 +54,12 @@ def test_gradient_is_the_slope_of_the_value(memory: adp.GlobalValue) -> None:
         torch.testing.assert_close(memory.gradient(x)[:, i], rise, rtol=1e-2, atol=1e-2)
 
 
-def test_one_state_gets_the_control_of_a_batch(memory: adp.GlobalValue) -> None:
+def test_one_state_gets_the_control_of_a_batch_and_none_gets_none(memory: adp.GlobalValue) -> None:
     batch = memory(RESETS)
     single = torch.cat([memory(x.unsqueeze(0)) for x in RESETS])
     torch.testing.assert_close(single, batch, rtol=1e-12, atol=1e-12)
     torch.testing.assert_close(memory(RESETS.view(2, 4, 2)), batch.view(2, 4, 1), rtol=1e-12, atol=1e-12)
+    assert memory(torch.zeros(0, 2, dtype=torch.float64)).shape == (0, 1)
 
 
 def test_a_whole_turn_changes_nothing(memory: adp.GlobalValue) -> None:
