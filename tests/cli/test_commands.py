@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 import threading
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from command_line import ROOT, environment
 from sweep_runs import write_run, write_sweep
 
 from staf_torch import __version__
@@ -45,16 +45,18 @@ def test_version_is_printed_with_a_hash_of_the_source(staf: Any) -> None:
 
 
 def test_a_reader_may_stop_early(tmp_path: Path) -> None:
-    write_sweep(tmp_path)
+    write_sweep(tmp_path, counts=(3,), seeds=(0,))
     tables = "import sys; from staf_torch.cli.table import main; sys.exit(main())"
-    for words in (["-m", "staf_torch", "schema"], ["-c", tables, str(tmp_path), "--format", "csv"]):
-        started = subprocess.Popen(
-            [sys.executable, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
-        assert started.stdout is not None
-        started.stdout.close()
-        assert "ipe" not in started.communicate()[1]
-        assert started.returncode == 0
+    started = subprocess.Popen(
+        [sys.executable, "-c", tables, str(tmp_path), "--format", "csv"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert started.stdout is not None
+    started.stdout.close()
+    assert "ipe" not in started.communicate()[1]
+    assert started.returncode == 0
 
 
 def test_the_doctor_finds_this_machine_sound(staf: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -66,11 +68,11 @@ def test_the_doctor_finds_this_machine_sound(staf: Any, monkeypatch: pytest.Monk
     assert "OMP_NUM_THREADS 1" in said
 
 
-@pytest.mark.parametrize("command", ["doctor", "schema", "docs"])
-def test_help_of_a_command_is_its_line(staf: Any, command: str) -> None:
-    code, said = staf(command, "--help")
-    assert (code or 0, said.count("\n")) == (0, 1)
-    assert said.startswith(f"staf {command}")
+def test_help_of_a_command_is_its_line(staf: Any) -> None:
+    for command in ("doctor", "schema", "docs"):
+        code, said = staf(command, "--help")
+        assert (code or 0, said.count("\n")) == (0, 1)
+        assert said.startswith(f"staf {command}")
 
 
 def test_the_doctor_says_where_the_problem_is(
@@ -84,18 +86,25 @@ def test_the_doctor_says_where_the_problem_is(
     assert "not a folder" in line
 
 
-CODE = "import os, sys, staf_torch.cli; print(os.environ['OMP_WAIT_POLICY'], 'torch' in sys.modules)"
+CODE = """import os, sys
+sys.path.insert(0, 'staf_torch/plugins')
+import staf_torch.cli, hydra_plugins.staf_batched
+print(os.environ['OMP_WAIT_POLICY'], *{'torch', 'numpy', 'matplotlib'} & set(sys.modules))
+"""
 
 
 @pytest.mark.parametrize("stated", [None, "active"])
-def test_threads_leave_the_processor_while_they_wait_unless_the_user_says_otherwise(
+def test_a_command_and_the_plugin_begin_without_torch_and_threads_leave_the_processor_while_they_wait(
     stated: str | None,
 ) -> None:
-    others = {key: value for key, value in os.environ.items() if key != "OMP_WAIT_POLICY"}
-    given = {} if stated is None else {"OMP_WAIT_POLICY": stated}
-    command = [sys.executable, "-c", CODE]
-    said = subprocess.run(command, env=others | given, capture_output=True, text=True, check=True).stdout
-    assert said.split() == [stated or "passive", "False"]  # before torch is loaded, or it has no effect
+    others = {key: value for key, value in environment().items() if key != "OMP_WAIT_POLICY"}
+    given = (
+        {} if stated is None else {"OMP_WAIT_POLICY": stated}
+    )  # before torch is loaded, or it has no effect
+    begun = subprocess.run(
+        [sys.executable, "-c", CODE], cwd=ROOT, env=others | given, capture_output=True, text=True, check=True
+    )
+    assert begun.stdout.split() == [stated or "passive"]
 
 
 # `staf-table`

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 import json
 import sys
-from pathlib import Path
 from typing import Any
 
 import composing
@@ -34,38 +32,30 @@ def faults(whole: dict[str, Any], group: str, settings: Any) -> list[str]:
     return [error.message for error in jsonschema.Draft202012Validator(node).iter_errors(settings)]
 
 
-def test_it_is_a_schema(whole: dict[str, Any]) -> None:
+def test_a_file_that_ships_is_valid_and_with_a_wrong_key_it_is_not(whole: dict[str, Any]) -> None:
     pytest.importorskip("jsonschema").Draft202012Validator.check_schema(whole)
-
-
-@pytest.mark.parametrize("path", FILES, ids=lambda path: path.relative_to(CONF).as_posix())
-def test_a_file_that_ships_is_valid_and_with_a_wrong_key_it_is_not(path: Path, whole: dict[str, Any]) -> None:
-    group = path.relative_to(CONF).parent.as_posix()
-    settings = OmegaConf.to_container(OmegaConf.load(path))
-    assert faults(whole, group, settings) == []
-    wrong = copy.deepcopy(settings)
-    wrong["raduis"] = 0.1
-    assert faults(whole, group, wrong)
+    for path in FILES:
+        group = path.relative_to(CONF).parent.as_posix()
+        settings = OmegaConf.to_container(OmegaConf.load(path))
+        assert faults(whole, group, settings) == [], path
+        assert faults(whole, group, {**settings, "raduis": 0.1}), path
 
 
 def test_settings_of_a_run_are_valid(whole: dict[str, Any]) -> None:
-    for options in (["experiment=adp"], ["kernel=matern", "optimizer=exact", "sweep.records=table"]):
-        assert faults(whole, ".", OmegaConf.to_container(composing.settings(*options))) == []
+    options = ["kernel=matern", "optimizer=exact", "sweep.records=table"]
+    assert faults(whole, ".", OmegaConf.to_container(composing.settings(*options))) == []
 
 
 @pytest.mark.parametrize(
     ("group", "settings"),
     [
-        ("kernel", {"_target_": "staf_torch.GaussianKernel", "length_scale": 1.0}),
         ("kernel", {"_target_": "staf_torch.GaussianKernel", "width": "wide"}),
         ("kernel", {"_target_": "staf_torch.GausianKernel"}),
         ("centers", {"radius": 0.1, "shrink": {"ofset": 0.0}}),
         ("optimizer", {"_target_": "staf_torch.optim.HeavyBall.from_settings", "inner_steps": 1.5}),
         ("adp", {"gains": {"critc": 0.1}}),
-        ("adp/law", {"_target_": "staf_torch.adp.Frozen", "gians": None}),
         (".", {"dtype": "float16"}),
         (".", {"task": "gradient_chasing"}),
-        (".", {"kernel": {"widht": 1.0}}),
         (".", {"adp": {"rollout": {"horizont": 1.0}}}),
         ("experiment", {"laws": {"worc": 11}}),
     ],
@@ -78,11 +68,9 @@ def test_what_is_mistyped_is_not_valid(group: str, settings: Any, whole: dict[st
     ("group", "settings"),
     [
         ("kernel", {"_target_": "cauchy.Cauchy", "width": 0.7}),
-        ("kernel", {"width": 2}),
         ("target", {"_target_": "valley.Valley", "depth": [1, 2]}),
         ("centers", {"radius": "${spread}", "count": 6}),
         ("experiment", {"task": "closeness.closeness", "defaults": [{"override /kernel": "matern"}]}),
-        (".", {"animation": False, "adp": {"q": 1.0}}),
         (".", {"animation": True, "figures": False}),
         (".", {"figures": {"width": 3.4, "font": "9 serif"}}),
         (".", {"animation": "html", "adp": {"q": [[1.0, 0.0], [0.0, 2.0]]}}),
@@ -110,7 +98,6 @@ def test_the_command_prints_the_schema_of_a_group(
     printed = json.loads(capsys.readouterr().out)
     assert printed["$ref"] == "#/$defs/adp.law"
     assert "adp.law" in printed["$defs"]
-    assert json.loads(schema.main([]))["additionalProperties"] is False
     monkeypatch.setattr(sys, "argv", ["staf", "schema", "kernels"])
     with pytest.raises(
         SystemExit, match=r"`staf schema\(group=...\)` must be one of 'experiment', 'adp/basis', "

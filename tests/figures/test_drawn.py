@@ -10,7 +10,6 @@ import pytest
 from figures.drawing import (
     LINEAR_LOG,
     LOG,
-    LOG_LINEAR,
     Curve,
     T,
     holds,
@@ -176,45 +175,8 @@ FIGURES: dict[str, Callable[[], Drawn]] = {
 }
 
 
-CROWDED = FIGURES.keys() - {
-    "a chase of many centers",  # the others of a kind have more names in their legends
-    "a memory on a line",
-    "a loop of many functions",
-    "a feedback",
-}
+CROWDED = {"a chase", "a loop that learns", "faults", "layouts"}
 """Those whose legends and names are looked at in a column of 3.4 inches, laid out."""
-
-
-def test_a_comparison_counts_states_up_to_a_multiple_of_the_optimal_cost() -> None:
-    (axes,) = visible(
-        closed_loop.draw_comparison({"a": np.array([3.0, 1.0, np.inf, 1.5]), "b": np.array([2.0])})
-    )
-    curves = [("a", [1e-4, 0.5, 2.0], [0.25, 0.5, 0.75]), ("b", [1.0], [1.0])]
-    names = "excess cost $J/J^* - 1$", "share of initial states regulated"
-    holds(axes, curves, names, scales=LOG_LINEAR, xlim=(1e-4, 4), ylim=(0, 1.02))
-    assert legend(axes.figure) == ["a", "b"]
-
-
-def test_rivals_are_points_hollow_where_they_fail_from_some_states() -> None:
-    rows = [
-        {"plant": plant, "method": method, "us_median": 3.0 * k + 1, "ratio_median": ratio, "regulated": part}
-        for k, (plant, method, ratio, part) in enumerate(
-            [
-                ("cart_pole", "a", 1.5, 1),
-                ("cart_pole", "b", 1.0, 0.5),
-                ("mass", "a", None, 0),
-                ("mass", "b", 1.1, 1),
-            ]
-        )
-    ]
-    figure = closed_loop.draw_rivals(rows)
-    cart, mass = visible(figure)
-    names = r"time a control ($\mu$s)", "median excess cost"
-    holds(cart, [("a", [1], [0.5]), ("b", [4], [1e-5])], names, scales=LOG)
-    holds(mass, [("b", [10], [0.1])], (names[0], ""), scales=LOG)
-    assert [line.get_fillstyle() for line in cart.get_lines()[:2]] == ["full", "none"]
-    assert [axes.get_title() for axes in (cart, mass)] == ["cart pole", "mass"]
-    assert legend(figure) == ["a", "b"]
 
 
 @pytest.mark.parametrize("circle", [True, False])
@@ -268,7 +230,7 @@ def _panels(spread: float) -> list[sweep.Panel]:
     return [sweep.Panel("Gaussian kernel", curves), sweep.Panel("exponential kernel", curves[:1])]
 
 
-@pytest.mark.parametrize(("spread", "rounding"), [(1.5, 4e-3), (1.0, None), (1.05, 1e-13)])
+@pytest.mark.parametrize(("spread", "rounding"), [(1.5, 4e-3), (1.0, 1e-13)])
 def test_errors_of_a_sweep_are_drawn_with_their_bands(spread: float, rounding: float | None) -> None:
     panels, x = _panels(spread), np.array([0.1, 0.2])
     figure = sweep.draw_error_against_radius(panels, rounding)

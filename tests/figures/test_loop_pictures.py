@@ -51,14 +51,6 @@ def tracking() -> tuple[Any, ...]:
     return plant, cost, plant.at(torch.tensor([[0.5, 0.1]]))
 
 
-def black_box() -> tuple[Any, ...]:
-    def step(x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        return x + 0.05 * np.stack((x[:, 1], u[:, 0] - x[:, 0]), axis=-1)
-
-    plant = systems.StepPlant(step, dim=2, inputs=1, dt=0.05)
-    return plant, adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1), torch.tensor([[0.5, 0.1]])
-
-
 def wide() -> tuple[Any, ...]:
     """Bounds far from all controls, units for two states where there are three."""
     plant = systems.Linear(torch.diag(torch.tensor([-1.0, -1, -1])), torch.ones(3, 2))
@@ -72,7 +64,6 @@ CASES = {
     pendulum: ["$x_{1}$ (rad)", "$x_{2}$ (rad/s)", "control $u$ (N m)", COST],
     unnamed: [STATE, INPUT, COST],
     tracking: [STATE, INPUT, COST],  # the clock is no state to look at
-    black_box: [STATE, INPUT, COST],
     wide: ["state $x$ (m, kg)", "control $u$ (V)", COST],
 }
 
@@ -154,8 +145,6 @@ def test_a_loop_without_an_lqr_says_why_and_is_drawn(caplog: pytest.LogCaptureFi
     ("options", "message"),
     [
         ({"rows": [3]}, r"figure\(rows=...\)` must be some of the 3 rows"),
-        ({"rows": []}, "rows"),
-        ({"width": -1}, r"`LoopResult.figure\(width=...\)` must be inches"),
         ({"font": "Comic Sands"}, r"`LoopResult.figure\(font=...\)` must name a font"),
     ],
 )

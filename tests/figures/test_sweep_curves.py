@@ -44,48 +44,15 @@ def test_runs_without_a_positive_error_are_in_no_panel(runs: Any) -> None:
     assert sweep.cost_against_accuracy(found) == []
 
 
-def test_a_floor_is_drawn_where_it_is_known_and_the_largest_rounding_of_all_is_said(runs: Any) -> None:
-    floors = (None, 0.0, 0.1, 0.2)
-    found = runs(
-        [
-            ({RADIUS: k + 1}, {"ball_error": 1.0, "ball_floor_error": floor, "rounding_floor": floor})
-            for k, floor in enumerate(floors)
-        ]
-    )
-    ((curve,),) = (panel.curves for panel in sweep.error_against_radius(found))
-    assert [point.x for point in curve.points] == [1.0, 2.0, 3.0, 4.0]
-    assert [(point.x, point.middle) for point in curve.floor] == [(3.0, 0.1), (4.0, 0.2)]
-    assert sweep.rounding_floor(found) == 0.2
-
-
-def test_a_radius_or_a_count_that_is_no_number_is_no_point(runs: Any) -> None:
-    given = [({RADIUS: r, COUNT: c}, errors()) for r in (0.1, 0.2, "auto") for c in (3, None)]
-    (panel,) = sweep.error_against_radius(runs(given))
-    assert [curve.label for curve in panel.curves] == ["3 centers", "all centers"]
-    assert [[point.x for point in curve.points] for curve in panel.curves] == [[0.1, 0.2]] * 2
-
-
-def test_curves_are_in_the_order_of_their_counts_and_points_of_their_radii(runs: Any) -> None:
-    (panel,) = sweep.error_against_radius(
-        runs([({RADIUS: r, COUNT: c}, errors(error=r * c)) for r in (0.4, 0.1) for c in (10, 3, 6)])
-    )
-    assert [curve.label for curve in panel.curves] == ["3 centers", "6 centers", "10 centers"]
-    assert [[point.middle for point in curve.points] for curve in panel.curves] == [
-        [pytest.approx(0.1 * c), pytest.approx(0.4 * c)] for c in (3, 6, 10)
-    ]
-
-
 @pytest.mark.parametrize(
     ("swept", "titles"),
     [
-        ({}, ["exponential kernel"]),
         ({"kernel": ("matern", "gaussian")}, ["Matérn kernel", "Gaussian kernel"]),
         ({"kernel": (None,)}, [""]),
         (
             {"kernel": ("custom",), "kernel.path": ("mine.Cauchy", "__main__.Own")},
             ["Cauchy kernel", "Own kernel"],
         ),
-        ({"dt": (0.1, 0.2)}, ["dt = 0.1", "dt = 0.2"]),
         (
             {"kernel": ("inverse_multiquadric", "other"), "centers": ("rings", "ball")},
             [
@@ -116,31 +83,6 @@ def test_seeds_are_one_point_with_the_interval_of_students_t(runs: Any) -> None:
         assert point.middle == pytest.approx(r * math.exp(0.5))
         assert point.low == pytest.approx(r * math.exp(0.5 - half))
         assert point.high == pytest.approx(r * math.exp(0.5 + half))
-
-
-def test_equal_errors_of_all_seeds_have_no_spread(runs: Any) -> None:
-    given = [({RADIUS: r, "seed": s}, errors(error=0.3)) for r in (0.1, 0.2) for s in range(3)]
-    (panel,) = sweep.error_against_radius(runs(given))
-    assert panel.curves[0].points == tuple(sweep.Point(r, 0.3, 0.3, 0.3) for r in (0.1, 0.2))
-
-
-@pytest.mark.parametrize("kernels", [("exponential",), ("exponential", "gaussian")])
-def test_a_map_has_a_row_a_count_and_a_column_a_radius(kernels: tuple[str, ...], runs: Any) -> None:
-    given = [
-        ({"kernel": kernel, RADIUS: r, COUNT: c}, errors(error=r * c + at))
-        for at, kernel in enumerate(kernels)
-        for r in (0.4, 0.1, 0.2)
-        for c in (6, 3)
-        if (r, c) != (0.2, 6)
-    ]
-    maps = sweep.heat_maps(runs(given))
-    for at, shown in enumerate(maps):
-        assert (shown.radii, shown.counts) == ((0.1, 0.2, 0.4), (3, 6))
-        want = [[0.1 * 3 + at, 0.2 * 3 + at, 0.4 * 3 + at], [0.1 * 6 + at, None, 0.4 * 6 + at]]
-        assert [list(row) for row in shown.errors] == [
-            [None if each is None else pytest.approx(each) for each in row] for row in want
-        ]
-    assert len(maps) == len(kernels)
 
 
 def test_radii_are_panels_where_laws_differ_and_lines_where_they_do_not(runs: Any) -> None:

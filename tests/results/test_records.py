@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 
 from staf_torch import __version__
 from staf_torch.results import build, run_record
-from staf_torch.results.build import checksums, damage, damaged, differences, record_checksum, short
+from staf_torch.results.build import checksums, damage, differences, record_checksum, short
 from staf_torch.results.run import MetricInfo
 from staf_torch.results.run_directory import HistoryWriter
 from staf_torch.results.run_record import RunRecord
@@ -29,14 +29,12 @@ def record(settings: Any = None, **more: Any) -> dict[str, Any]:
 
 
 CHANGES: list[tuple[dict[str, Any], dict[str, Any], list[str]]] = [
-    (record({"dt": 1.0}), record(), []),
     (
         record({"dt": 2, "b": "x"}),
         record({"dt": 1, "a": [1]}),
         ["a was nothing and is now [1]", "b was x and is now nothing", "dt was 2 and is now 1"],
     ),
-    (record({"a": (1, 2)}), record({"a": [1, 2]}), []),
-    (record({"a": "x" * 81}), record({"a": 1}), [f"a was {'x' * 77}... and is now 1"]),
+    (record({"a": (1, 2), "dt": 1.0}), record({"a": [1, 2], "dt": 1}), []),
     (
         record(source="z", torch="z", compiler="z"),
         record(),
@@ -50,7 +48,6 @@ CHANGES: list[tuple[dict[str, Any], dict[str, Any], list[str]]] = [
         record(),
         ["the module gone has changed", "the module own has changed"],
     ),
-    (record(imported={"absent_module": "1"}), record(), ["the module absent_module has changed"]),
 ]
 
 
@@ -84,7 +81,7 @@ OWN_FILES = {
 }
 
 
-@pytest.mark.parametrize("folder", ["mine", "site-packages", "dist-packages"])
+@pytest.mark.parametrize("folder", ["mine", "site-packages"])
 def test_a_module_is_recorded_with_what_it_imports_and_an_installed_one_with_its_package_alone(
     folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -98,20 +95,6 @@ def test_a_module_is_recorded_with_what_it_imports_and_an_installed_one_with_its
     assert package >= {"plants.own", "plants.near", "plants.sub.far", "plants.deep"}
     assert set(made) - package == ({"other", "further"} if folder == "mine" else set())
     assert made["plants.near"] == hashlib.sha256(b"no python (").hexdigest()[:12]
-
-
-def test_settings_name_modules_by_their_task_their_targets_and_their_paths(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name in ("my_task", "my_kernel", "my_target", "my_system"):
-        (tmp_path / f"{name}.py").write_text("")
-    monkeypatch.syspath_prepend(str(tmp_path))
-    settings = {
-        **{"task": "my_task.run", "kernel._target_": "my_kernel.Own", "target.path": "my_target.f"},
-        **{"target._target_": "staf_torch.settings.chase.load", "metric._target_": 3},
-        **{"system.path": "my_system.f", "system._target_": "staf_torch.systems.Own"},
-    }
-    assert list(build.modules(settings)) == ["my_kernel", "my_target", "my_task"]
 
 
 def test_modules_imported_by_names_that_code_makes_are_recorded_too(
@@ -133,25 +116,6 @@ def test_modules_imported_by_names_that_code_makes_are_recorded_too(
 # The files of a run
 
 
-def test_damage_is_reported_of_the_first_file_that_has_some(tmp_path: Path) -> None:
-    (tmp_path / "a").write_bytes(b"content")
-    right = [7, hashlib.sha256(b"content").hexdigest()]
-    assert damage(tmp_path, {"a": right}, thorough=True) is None
-    for odd in (3, [], [7], [*right, 1]):
-        assert damage(tmp_path, {"a": odd}, thorough=False) == "a has no checksum"
-    for name in ("/a", "../a", "b/../a"):
-        assert damage(tmp_path, {name: right}, thorough=False) == f"{name} has no checksum"
-    said = "a is damaged: it has 7 bytes in place of 8"
-    assert damage(tmp_path, {"a": [8, right[1]]}, thorough=False) == said
-    wrong = {"files": {"a": [7, "0"]}, "x": 1}
-    assert damaged(tmp_path, wrong, thorough=False) is None
-    assert damaged(tmp_path, wrong, thorough=True) == "a is damaged: its checksum does not match"
-    (tmp_path / "link").symlink_to("a")
-    assert damage(tmp_path, {"link": [1, right[1]]}, thorough=True) is not None
-    assert damaged(tmp_path, {"a": 1, "checksum": record_checksum({"a": 1})}, thorough=True) is None
-    assert damaged(tmp_path, {"a": 2, "checksum": record_checksum({"a": 1})}, thorough=True) is not None
-
-
 def test_result_files_have_checksums_and_logs_links_and_hidden_ones_none(tmp_path: Path) -> None:
     for name in ("metrics.json", "run.json", "staf.log", ".hidden", ".hydra/c.yaml", "figures/a.png"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
@@ -163,7 +127,7 @@ def test_result_files_have_checksums_and_logs_links_and_hidden_ones_none(tmp_pat
     }
 
 
-@pytest.mark.parametrize("how", ["a history", "stored", "compressed", "of earlier", "no archive"])
+@pytest.mark.parametrize("how", ["a history", "compressed", "of earlier"])
 def test_any_byte_of_a_history_that_changes_is_found(how: str, tmp_path: Path) -> None:
     path, rng = tmp_path / "history.npz", np.random.default_rng(0)
     first, second = rng.normal(size=(2, 3, 2)), np.ones((2, 3))
@@ -172,8 +136,6 @@ def test_any_byte_of_a_history_that_changes_is_found(how: str, tmp_path: Path) -
             for row in range(2):
                 writer.add({"first": first[row : row + 1], "second": second[row : row + 1]}, row)
             writer.close(time=np.arange(3))
-    elif how == "no archive":
-        path.write_bytes(rng.bytes(200))
     else:
         (np.savez_compressed if how == "compressed" else np.savez)(path, first=first, second=second)
     content = path.read_bytes()
@@ -181,7 +143,7 @@ def test_any_byte_of_a_history_that_changes_is_found(how: str, tmp_path: Path) -
     if how == "of earlier":
         written = {path.name: [len(content), hashlib.sha256(content).hexdigest()]}
     assert damage(tmp_path, written, thorough=True) is None
-    for place in range(0, len(content), 3):
+    for place in range(0, len(content), 7):
         changed = bytearray(content)
         changed[place] ^= 1 << place % 8
         path.write_bytes(changed)
@@ -253,21 +215,6 @@ def test_jobs_are_added_to_what_was_noted_of_the_sweep(tmp_path: Path) -> None:
     }
 
 
-@pytest.mark.parametrize(
-    "value",
-    [
-        *("plain", "a b", "it's", "a/b@c+d.e-f_1", "", "ü", "'", "''", "a'b'"),
-        *("back\\slash", "\\", "\\\\", "\\'", "\\\\'x\\\\y\\", "'\\'", "\\ "),
-        *("1e3", "007", "1_000", "-5", ".5", "+1", "null", "True", "false", "NaN", "inf", "nullable", "1a"),
-    ],
-)
+@pytest.mark.parametrize("value", ["it's", "", "ü", "a'b'", "\\'x\\y\\", "1e3", "1_000", "null", "inf", "1a"])
 def test_a_text_is_quoted_for_the_grammar_of_hydra(value: str) -> None:
     assert parse_override(f"key={run_record.quoted(value)}").value() == value
-
-
-@pytest.mark.parametrize("said", [True, False, None, "true", 1])
-def test_runs_made_otherwise_count_only_where_that_is_said_by_true(said: object) -> None:
-    cfg = OmegaConf.create({"sweep": {"resume_anyway": said}})
-    assert run_record.resumed_anyway(cfg) is (said is True)
-    assert not run_record.resumed(cfg)
-    assert run_record.resumed(OmegaConf.create({"sweep": {"resume": "outputs/1"}}))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import composing
 import pytest
@@ -25,7 +24,7 @@ OPTIONS = {
     for group in ("policy", "law", "basis", "extrapolation", "cost")
 }
 PARTS = [OPTIONS[group] for group in ("law", "basis", "extrapolation")]  # of the policy that learns
-LINES = [f"adp/policy={option}" for option in OPTIONS["policy"]]
+LINES = [f"adp/policy={option}" for option in OPTIONS["policy"] if option not in ("lqr", "actor_critic")]
 LINES += [f"adp/policy=lqr adp/cost={option}" for option in OPTIONS["cost"]]
 LINES += [
     "adp/law={} adp/basis={} adp/extrapolation={}".format(*(part[number % len(part)] for part in PARTS))
@@ -59,11 +58,6 @@ def test_options_combine() -> None:
     )
     assert built.dt == 0.01  # the period of the rollout policy
     assert control(built).abs().max() <= 0.2
-    learner = problem("adp/basis=quadratic", "adp/law=published", "adp/extrapolation=quadrature").controller
-    assert isinstance(learner, adp.ActorCritic)
-    assert (learner.basis.count, learner.extrapolation.count) == (3, 49)
-    assert isinstance(learner.law, adp.Published)
-    torch.testing.assert_close(learner.critic, torch.tensor([1.0, 0.0, 1.0], dtype=torch.float64))
 
 
 MODULE = '''
@@ -150,7 +144,7 @@ def test_model_of_mujoco_is_a_plant_of_closed_loops(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("steps", "batch", "every"),
-    [(100, 1, 1), (1000, 400, 2), (999, 401, 3), (7, 10**5, 7), (8, 10**5, 4), (5, 10**6, 5)],
+    [(100, 1, 1), (999, 401, 3), (8, 10**5, 4)],
 )
 def test_of_many_states_so_few_are_recorded_that_they_fit(steps: int, batch: int, every: int) -> None:
     line = ("adp/policy=lqr", "dt=0.01", f"duration={0.01 * steps}", f"trajectories={batch}")
@@ -158,20 +152,22 @@ def test_of_many_states_so_few_are_recorded_that_they_fit(steps: int, batch: int
     assert problem(*line, "adp.record_every=7").every == 7
 
 
-def looped(*overrides: str) -> Any:
-    return loops.adp_problem(composing.settings("experiment=adp", "adp/policy=lqr", *overrides))
-
-
 def test_a_loop_has_the_steps_that_fit_its_duration_and_its_own_choices() -> None:
-    built = looped(
-        "dt=0.1", "duration=1.04", "seed=5", "trajectories=3", "adp.record_every=2", "adp.integrator=euler"
+    built = problem(
+        "adp/policy=lqr",
+        "dt=0.1",
+        "duration=1.04",
+        "seed=5",
+        "trajectories=3",
+        "adp.record_every=2",
+        "adp.integrator=euler",
     )
     assert (built.dt, built.steps, built.every, built.seed, built.integrator) == (0.1, 10, 2, 5, "euler")
     assert built.initial_states.shape == (3, 2)
-    assert looped("dt=0.1", "duration=0.05001").steps == 1
+    assert problem("adp/policy=lqr", "dt=0.1", "duration=0.05001").steps == 1
     with pytest.raises(ValueError, match=r"duration=...` must be at least one step \(dt=0.1\); got 0.049"):
-        looped("dt=0.1", "duration=0.049")
-    single = looped("dtype=float32")
+        problem("adp/policy=lqr", "dt=0.1", "duration=0.049")
+    single = problem("adp/policy=lqr", "dtype=float32")
     assert single.initial_states.dtype == torch.float32
     for module in (single.system, single.cost, single.controller):
         assert isinstance(module, nn.Module)
@@ -199,39 +195,8 @@ def test_options_of_groups_are_exchanged_by_name_and_numbers_as_they_are() -> No
         loops.changed(cfg, {"policy": "no"})
 
 
-class Asking(nn.Module):
-    """A policy that asks for all that there is."""
-
-    def __init__(self, **given: Any) -> None:
-        super().__init__()
-        self.given = given
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return x
-
-
-def asking(
-    system: Any, model: Any, plant: Any, cost: Any, dim: Any, inputs: Any, lqr: Any,
-    basis: Any, extrapolation: Any, law: Any, critic: Any, actor: Any,
-) -> Asking:  # fmt: skip
-    return Asking(**locals())
-
-
-def test_a_policy_gets_whatever_it_asks_for_by_name() -> None:
+def test_weights_are_those_of_the_settings() -> None:
     weights = "adp.critic=[0.1,0.2,0.3]", "adp.actor=[0.4,0.5,0.6]", "adp.trust=null"
-    cfg = composing.settings("experiment=adp", *weights)
-    learner = loops.adp_problem(cfg).controller
+    learner = problem(*weights).controller
     assert isinstance(learner, adp.ActorCritic)
     assert (learner.critic.tolist(), learner.actor.tolist()) == ([0.1, 0.2, 0.3], [0.4, 0.5, 0.6])
-    cfg.adp.policy = {"_target_": f"{__name__}.asking"}
-    system = loops.plant(cfg)
-    cost = loops.make_cost(cfg, system)
-    held = loops.controller(cfg, system, cost)
-    assert isinstance(held, adp.Feedback)
-    given = held.policy.given
-    assert given["system"] is given["model"] is given["plant"] is system
-    assert (given["cost"], given["dim"], given["inputs"]) == (cost, 2, 1)
-    kinds = {"lqr": adp.LQR, "basis": adp.ValueBasis, "extrapolation": adp.Extrapolation}
-    for name, kind in {**kinds, "law": adp.ActorCriticLaw}.items():
-        assert isinstance(given[name], kind)
-    assert (given["critic"], given["actor"]) == ([0.1, 0.2, 0.3], [0.4, 0.5, 0.6])

@@ -6,18 +6,15 @@ tests/experiments/test_settings_refused.py.
 
 from __future__ import annotations
 
-import functools
 import math
 import re
-import warnings
 from collections.abc import Callable
 from typing import Any
 
 import composing
 import pytest
 import torch
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 from torch import Tensor
 
 import staf_torch as st
@@ -25,30 +22,11 @@ from staf_torch import StateFollowingCenters
 from staf_torch.metrics import Metric
 from staf_torch.settings import chase
 from staf_torch.settings.chase import ChaseProblem, chase_problem, make, make_centers
-from staf_torch.settings.plain import PlainSettings
 from staf_torch.sweeps.hydra_compat import named_packages, trusted
-
-GROUPS = ("kernel", "centers", "target", "system", "optimizer")
-
-
-@functools.cache
-def composed(*choices: str) -> DictConfig:
-    return composing.settings(*choices)
-
-
-def settings(line: str) -> DictConfig:
-    """A command line as Hydra would compose it, each choice of groups but once."""
-    words = line.split()
-    choices = [word for word in words if word.partition("=")[0] in GROUPS]
-    values = [word for word in words if word not in choices]
-    cfg = composed(*choices).copy()
-    for value in OverridesParser.create().parse_overrides(values):
-        OmegaConf.update(cfg, value.key_or_group, value.value(), force_add=value.is_add())
-    return cfg
 
 
 def problem(line: str) -> ChaseProblem:
-    return chase_problem(settings(line))
+    return chase_problem(composing.settings(*line.split()))
 
 
 @pytest.mark.parametrize(
@@ -58,33 +36,21 @@ def test_number_of_steps_survives_rounding(dt: float, duration: float, steps: in
     assert problem(f"dt={dt} duration={duration}").steps == steps
 
 
-BAD: dict[str, tuple[str, tuple[str, ...]]] = {
-    "radius is a word": ("centers.radius=abc", ("(radius=...)` must be a number; got 'abc'.",)),
-    "long initial state": ("initial_state=[1,2,3]", ("initial_state=...` must have 2 entries",)),
-    "unknown device": ("device=nope", ("`staf device=...` cannot be used here",)),
-    "path without a module": ("target=custom target.path=bowl", ("must be a dotted path",)),
-    "arguments of a function": (
-        "target=custom target.path=math.cos +target.arguments.a=1",
-        ("needs a class or a function at math.cos",),
-    ),
-    "kernel that is none": ("kernel=custom kernel.path=math.cos", ("(kernel=...)` must be a Kernel",)),
-    "system that is none": ("system=custom system.path=math.cos", ("must be a plant with a method `drift`",)),
-    "target that is none": ("target=custom target.path=math.pi", ("`staf target=...` must be callable",)),
-}
-
-
-@pytest.mark.parametrize("name", BAD)
-def test_a_bad_value_is_named(name: str) -> None:
-    line, expected = BAD[name]
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("centers.radius=abc", "(radius=...)` must be a number; got 'abc'."),
+        ("initial_state=[1,2,3]", "initial_state=...` must have 2 entries"),
+        ("device=nope", "`staf device=...` cannot be used here"),
+        ("kernel=custom kernel.path=math.cos", "(kernel=...)` must be a Kernel"),
+        ("target=custom target.path=math.pi", "`staf target=...` must be callable"),
+    ],
+)
+def test_a_bad_value_is_named(line: str, said: str) -> None:
     own = trusted(named_packages(line.split()))  # as of the command
     with own, pytest.raises(Exception) as found:  # noqa: PT011 (Hydra wraps some; the command unwraps them)
         problem(line)
-    messages, error = [], found.value
-    while error is not None:
-        messages.append(str(error))
-        error = error.__cause__
-    for words in expected:
-        assert words in "\n".join(messages)
+    assert said in str(found.value) + str(found.value.__cause__)
 
 
 def test_centers_of_the_users_own_class_are_made_and_other_things_refused() -> None:
@@ -126,17 +92,13 @@ POINTS = [[0.0, 1.0], [1.0, 0.0], [-1.0, 0.0]]
     [
         ({"layout": "rings", "count": 6}, lambda: st.rings(6)),
         ({"layout": "polygon", "count": 4, "dim": 2}, lambda: st.polygon(4)),
-        ({"layout": "simplex", "dim": 3}, lambda: st.simplex(3)),
         ({"layout": "simplex", "dim": 3, "count": 4}, lambda: st.simplex(3)),
         ({"layout": "cross_polytope", "dim": 2, "count": 4}, lambda: st.cross_polytope(2)),
         ({"layout": "ball", "dim": 3, "count": 4}, lambda: st.ball(4, 3)),
-        ({"layout": "directions", "directions": POINTS}, lambda: torch.tensor(POINTS).double()),
         ({"layout": "directions", "directions": POINTS, "dim": 2}, lambda: torch.tensor(POINTS).double()),
     ],
 )
-@pytest.mark.parametrize(
-    "size", [{}, {"radius": 0.3}, {"radius": 0.3, "shrink": {"offset": 0.2, "gain": 2.0}}]
-)
+@pytest.mark.parametrize("size", [{}, {"radius": 0.3, "shrink": {"offset": 0.2, "gain": 2.0}}])
 def test_centers_are_those_of_the_layout_and_the_radius(
     given: dict[str, Any], wanted: Callable[[], Tensor], size: dict[str, Any]
 ) -> None:
@@ -158,15 +120,9 @@ def test_centers_are_those_of_the_layout_and_the_radius(
             {"layout": "polygon", "count": 3, "dim": 3},
             "`centers=polygon` lies in the plane, but the system has 3 states: use",
         ),
-        ({"layout": "rings", "count": None}, "`rings(count=...)` must be an integer; got None."),
-        ({"layout": "directions"}, "`staf centers.directions=...` must be a list of points; got None."),
         (
             {"layout": "directions", "directions": "???"},
             "centers.directions=...` must be a list of points; got '???'.",
-        ),
-        (
-            {"layout": "directions", "directions": [[1.0]], "dim": 2},
-            "directions=...` must have 2 entries, one a state; got",
         ),
         (
             {"layout": "ball", "count": 3},
@@ -176,35 +132,11 @@ def test_centers_are_those_of_the_layout_and_the_radius(
             {"layout": "simplex", "dim": 2, "count": 4},
             "must be 3 (or null) for simplex with 2 states; got 4.",
         ),
-        ({"layout": "simplex", "dim": 2, "count": "4"}, "centers.count=...` must be an integer; got '4'."),
-        ({"layout": "simplex", "dim": 2, "count": 0}, "`staf centers.count=...` must be at least 1; got 0."),
     ],
 )
 def test_centers_that_there_are_not_are_refused(given: dict[str, Any], said: str) -> None:
     with pytest.raises(ValueError, match=re.escape(said)):
         chase.centers_of(**given)
-
-
-def test_equal_settings_share_one_object_and_repeat_its_warning() -> None:
-    parts = chase.Parts()
-
-    def built(*given: Any) -> object:
-        if len(given) > 1:
-            warnings.warn("two", stacklevel=1)
-        return object()
-
-    node = {"a": [1, {"b": 2}]}
-    first = parts(built, OmegaConf.create(node))
-    assert parts(built, OmegaConf.create(node)) is first
-    assert parts(built, PlainSettings(node)) is first
-    assert parts(built, OmegaConf.create({"a": [1, {"b": 3}]})) is not first
-    referring = [OmegaConf.create({"c": value, "part": {"a": "${c}"}}).part for value in (1, 2, 1)]
-    made = [parts(built, each) for each in referring]
-    assert made[0] is made[2] is not made[1]
-    assert parts(built, 1) is parts(built, 1) is not parts(built, "1")
-    for _ in range(2):
-        with pytest.warns(UserWarning, match="^two$"):
-            parts(built, 1, None)
 
 
 class Rows(Metric):
@@ -236,8 +168,6 @@ def test_metrics_are_none_one_or_several() -> None:
     assert isinstance(metric("Rows"), tuple)
     with pytest.raises(ValueError, match=r"metric=...` must have a name that no other metric has; got 'a'"):
         metric("two", names=["a", "a"])
-    with pytest.raises(ValueError, match=r"must have a name that no other metric has; got 'ball_error'"):
-        metric("Rows", name="ball_error")
     with pytest.raises(ValueError, match=r"metric=...` must be a `staf_torch.metrics.Metric`, or several"):
         metric("rows_and_words")
 
@@ -249,7 +179,6 @@ def test_a_path_is_a_class_that_is_called_or_a_thing_as_it_is() -> None:
     assert chase.load(f"{__name__}.Rows").name == "rows"
     for path, said in (
         ("pi", "must be a dotted path `package.module.name`; got 'pi'."),
-        (3, "must be a dotted path `package.module.name`; got 3."),
         ("math.no_such", "cannot be imported (module 'math' has no attribute 'no_such')"),
         ("no_such_module.x", "cannot be imported (No module named 'no_such_module'); got"),
     ):
@@ -279,8 +208,8 @@ def test_a_function_is_a_target_or_makes_a_plant() -> None:
         assert problem(line).system.drift(x).equal(made_plant(rate).drift(x))
 
 
-@pytest.mark.parametrize("spread", [0.5, 2.0])
-def test_states_are_the_stated_one_and_others_in_a_box_around_it(spread: float) -> None:
+def test_states_are_the_stated_one_and_others_in_a_box_around_it() -> None:
+    spread = 0.5
     given = {"initial_state": [1.0, -3.0], "trajectories": 200, "spread": spread, "seed": 0}
     states = chase.initial_states(OmegaConf.create(given), 2)
     assert states.shape == (200, 2)
@@ -297,16 +226,13 @@ def test_a_list_of_numbers_is_sorted_and_has_no_number_twice() -> None:
     for name, said in (
         ("none", "must be a list of numbers; got []"),
         ("word", "must be a list of numbers; got 'x'"),
-        ("absent", "must be a list of numbers; got None"),
         ("zero", "must be positive; got 0"),
     ):
         with pytest.raises(ValueError, match=re.escape(f"`staf {name}=...` {said}")):
             chase.numbers(cfg, name)
 
 
-@pytest.mark.parametrize(
-    ("states", "index"), [(1, [0]), (4, [0, 2, 5, 7]), (10, list(range(10))), (99, list(range(10)))]
-)
+@pytest.mark.parametrize(("states", "index"), [(4, [0, 2, 5, 7]), (99, list(range(10)))])
 def test_states_of_a_trajectory_are_equally_spaced_without_the_last(states: int, index: list[int]) -> None:
     cfg = composing.settings(
         "experiment=layouts", "dt=0.1", "duration=1.0", "trajectories=3", "centers.radius=0.25"

@@ -19,17 +19,14 @@ from staf_torch.signs import SHOWN, Progress
 from staf_torch.sweeps.batching import (
     DEFERRED,
     Computed,
-    Deferred,
     Failed,
     Written,
     batches,
     completion,
     groups,
-    reason,
     sentence,
     solve,
 )
-from staf_torch.sweeps.workers import LostError
 
 
 class Solved(NamedTuple):
@@ -79,9 +76,9 @@ def jobs(count: int, **more: Any) -> list[dict[str, Any]]:
 # Which share a batch
 
 
-@pytest.mark.parametrize("count", [1, 2, 6, 13])
-@pytest.mark.parametrize("least", [1, 3, 5, 100])
-@pytest.mark.parametrize("most", [None, 1, 2, 20])
+@pytest.mark.parametrize("count", [1, 6, 13])
+@pytest.mark.parametrize("least", [1, 3, 100])
+@pytest.mark.parametrize("most", [None, 2])
 def test_batches_are_every_job_once_in_order_and_as_many_as_keep_all_workers_busy(
     count: int, least: int, most: int | None
 ) -> None:
@@ -133,17 +130,11 @@ def cfgs(*seeds: int, **more: Any) -> list[DictConfig]:
     return [OmegaConf.create({"task": SIZED, "seed": seed, **more}) for seed in seeds]
 
 
-def test_a_batch_has_an_outcome_a_job_and_an_error_is_that_of_its_job() -> None:
-    one, two, three = solve(cfgs(2, 3, 4), SHOWN)
-    assert isinstance(one, Computed)
-    assert isinstance(two, Failed)
-    assert isinstance(three, Computed)
-    assert one.metrics == {"seed": 2.0, "together": 3.0}
-    assert str(two.error) == "odd"
-    assert three.metrics == {"seed": 4.0, "together": 3.0}
-
-
 def test_a_batch_that_raises_is_tried_job_by_job_and_that_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    one, two = solve(cfgs(2, 3), SHOWN)
+    assert isinstance(one, Computed)
+    assert isinstance(two, Failed)  # an error is that of its job
+    assert (one.metrics, str(two.error)) == ({"seed": 2.0, "together": 2.0}, "odd")
     found = solve(cfgs(2, 13), SHOWN)
     assert isinstance(found[0], Computed)
     assert found[0].metrics["together"] == 1.0
@@ -158,17 +149,6 @@ def test_a_batch_that_raises_is_tried_job_by_job_and_that_is_told(caplog: pytest
     assert caplog.messages == []
 
 
-def test_what_takes_no_part_in_batches_is_left_for_later() -> None:
-    assert solve([OmegaConf.create({"task": ALONE})] * 2, SHOWN) == [DEFERRED] * 2
-    assert isinstance(DEFERRED, Deferred)
-
-
-def test_the_first_settings_name_the_experiment_of_a_batch() -> None:
-    (first, second) = solve([*cfgs(2), OmegaConf.create({"task": ALONE, "seed": 4})], SHOWN)
-    assert isinstance(first, Computed)
-    assert isinstance(second, Computed)
-
-
 def test_what_is_left_to_do_follows_from_the_outcome(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -176,6 +156,7 @@ def test_what_is_left_to_do_follows_from_the_outcome(
     (cfg,) = cfgs(2)
     (computed,) = solve([cfg], SHOWN)
     assert completion(cfg, computed)(cfg, tmp_path / "7") == {"seed": 2.0, "together": 1.0, "place": 7.0}
+    assert solve([OmegaConf.create({"task": ALONE})] * 2, SHOWN) == [DEFERRED] * 2  # takes no part in batches
     assert completion(cfg, DEFERRED)(cfg, tmp_path) == {"alone": 1.0}
     with pytest.raises(ValueError, match="odd"):
         completion(cfg, Failed(ValueError("odd")))
@@ -207,19 +188,13 @@ OTHERS = "; others come with the extras joblib, slurm, ray and optuna"
     [
         (ValueError("ours"), "ours"),
         (ValueError("ours, and more\nfull_key: kernel"), "ours, and more"),
-        (RuntimeError("theirs"), "theirs"),
         (chained(HydraException("wrapped"), RuntimeError("between"), ValueError("ours")), "ours"),
-        (chained(HydraException("wrapped"), RuntimeError("between")), "wrapped"),
         (chained(RuntimeError("theirs"), OmegaConfBaseException("omega")), "theirs"),
         (DISK, "cannot write a/file: No space left"),
-        (OSError("no file"), "no file"),
-        (OSError(errno.ENOSPC, "No space left"), "[Errno 28] No space left"),
-        (chained(RuntimeError("theirs"), DISK), "theirs"),
         (
             ConfigKeyError("Could not override 'centers.raduis'.\nKey is not there"),
             "there is no setting `centers.raduis`; did you mean `centers.radius`?",
         ),
-        (HydraException("it Could not override 'a'"), "it Could not override 'a'"),
         (
             ConfigKeyError("Could not override 'optimizer.iterations'.\nKey is not there"),
             "there is no setting `optimizer.iterations`; did you mean `optimizer.inner_steps`?",
@@ -229,37 +204,13 @@ OTHERS = "; others come with the extras joblib, slurm, ray and optuna"
             "`kernel=a,b` is a list, and a list is a sweep: `staf -m kernel=a,b`; "
             "one setting that is a list is written `kernel=[a,b]`.",
         ),
-        (missing("kernel/gauss", ["a", "b"]), f"there is no `kernel/gauss`; there are a, b.{OWN}"),
         (
             missing("kernel/inverse_rot", ["matern", "inverse_multiquadric"]),
             "there is no `kernel/inverse_rot`; there are matern, inverse_multiquadric. "
             f"Did you mean `inverse_multiquadric`?{OWN}",
         ),
         (missing("hydra/launcher/x.yaml", ["a"]), f"there is no `hydra/launcher/x`; there are a{OTHERS}."),
-        (missing(None, ["a"]), f"there is no ``; there are a.{OWN}"),
-        (missing("kernel/gauss", []), "not found"),
-        (missing("kernel/gauss", None), "not found"),
     ],
 )
 def test_an_error_is_told_in_a_sentence(error: BaseException, words: str) -> None:
     assert sentence(error) == words
-
-
-@pytest.mark.parametrize(
-    ("error", "words"),
-    [
-        (KeyboardInterrupt(), "interrupted"),
-        (KeyboardInterrupt("why"), "interrupted"),
-        (ValueError("a\n  b"), "a b"),
-        (ValueError(""), "ValueError: "),
-        (RuntimeError("defect"), "RuntimeError: defect"),
-        (RuntimeError(""), "RuntimeError: "),
-        (KeyError("name"), "KeyError: 'name'"),
-        (DISK, "cannot write a/file: No space left"),
-        (LostError("it was lost"), "it was lost"),
-        (HydraException("told"), "told"),
-        (ConfigKeyError("told"), "told"),
-    ],
-)
-def test_a_record_has_one_line_and_the_type_of_a_defect(error: BaseException, words: str) -> None:
-    assert reason(error) == words

@@ -6,7 +6,7 @@ import importlib.util
 import json
 import logging
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -23,11 +23,9 @@ from staf_torch.sweeps.callbacks import (
     TensorBoardTracker,
     Tracker,
     TrackRuns,
-    claim,
     tracker,
 )
-from staf_torch.sweeps.job import PRINTS
-from staf_torch.sweeps.lock import TakenError, give_back, held
+from staf_torch.sweeps.lock import give_back, held
 from staf_torch.tables import RecordedRun, collect
 
 
@@ -36,14 +34,6 @@ def settings(place: Path, *typed: str, **more: Any) -> DictConfig:
     overrides = {"hydra": list(typed), "task": ["seed=0,1"]}
     node = {"sweep": {"dir": str(place)}, "run": {"dir": str(place)}, "overrides": overrides}
     return OmegaConf.create({"sweep": {"resume": None}, "hydra": node, **more})
-
-
-def asked(place: Path) -> DictConfig:
-    return settings(place, f"hydra.sweep.dir={place}")
-
-
-def resumed(place: Path) -> DictConfig:
-    return settings(place, sweep={"resume": str(place)})
 
 
 @pytest.fixture(autouse=True)
@@ -77,49 +67,6 @@ def test_sweeps_of_the_same_moment_have_directories_of_their_own_and_note_what_w
     assert taken == {"sweep", "sweep-2", "sweep-3", "sweep-4"}
 
 
-def test_a_directory_that_was_asked_for_is_taken_or_refused(tmp_path: Path) -> None:
-    place = tmp_path / "new" / "sweep"
-    claim(asked(place))
-    assert held(place) is not None
-    with pytest.raises(TakenError):
-        claim(asked(place))
-    give_back(place)
-    (place / "0").mkdir()
-    (place / "notes.txt").write_text("")
-    claim(asked(place))  # where something else is
-    give_back(place)
-    for left in ("sweep.json", "0/run.json"):
-        (place / left).write_text("{}")
-        with pytest.raises(ValueError, match=rf"{place} holds a sweep already.*sweep.resume={place}`"):
-            claim(asked(place))
-        give_back(place)
-        (place / left).unlink()
-
-
-@pytest.mark.parametrize("kind", [asked, resumed])
-def test_nothing_is_written_through_what_leads_elsewhere(
-    kind: Callable[[Path], DictConfig], tmp_path: Path
-) -> None:
-    place = tmp_path / "sweep"
-    (place / ".submitit").mkdir(parents=True)
-    (place / ".submitit" / "job").symlink_to(tmp_path)  # submitit's own
-    SweepDirectory().on_multirun_start(kind(place))
-    give_back(place)
-    (place / "sweep.json").unlink(missing_ok=True)
-    for count, more in enumerate(("", " and 1 more")):
-        (place / f"link{count}").symlink_to(tmp_path)
-        with pytest.raises(SystemExit, match=rf"^staf: {place}/link0{more} is a link"):
-            SweepDirectory().on_multirun_start(kind(place))
-        assert held(place) is None
-
-
-def test_a_sweep_that_is_resumed_keeps_what_was_noted(tmp_path: Path) -> None:
-    (tmp_path / "sweep.json").write_text("kept")
-    SweepDirectory().on_multirun_start(resumed(tmp_path))
-    assert held(tmp_path) is not None
-    assert (tmp_path / "sweep.json").read_text() == "kept"
-
-
 def test_a_file_in_the_way_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     config = settings(tmp_path / "file" / "a" / "b")
@@ -132,23 +79,19 @@ def test_a_file_in_the_way_is_named(tmp_path: Path) -> None:
         SweepDirectory().on_run_start(settings(tmp_path))
 
 
-@pytest.mark.parametrize("before", [True, False])
 def test_a_sweep_that_breaks_before_its_first_job_leaves_no_trace(
-    before: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    if before:
-        (tmp_path / "sweep").mkdir()
-        (tmp_path / "sweep" / "notes.txt").write_text("")
-    code, _, err = one(
-        str(tmp_path), ["-m", "seed=0,1", "hydra.launcher.executor=thread", "hydra.sweep.dir=sweep"]
-    )
-    assert code == 1
-    assert "executor=...)` must be one of 'inline'" in err
-    assert "report" not in err
-    assert [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")] == (
-        ["sweep", "sweep/notes.txt"] if before else []
-    )
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "notes.txt").write_text("")
+    for name in ("old", "new"):
+        line = ["-m", "seed=0,1", "hydra.launcher.executor=thread", f"hydra.sweep.dir={name}"]
+        code, _, err = one(str(tmp_path), line)
+        assert code == 1
+        assert "executor=...)` must be one of 'inline'" in err
+        assert "report" not in err
+    assert [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")] == ["old", "old/notes.txt"]
 
 
 # The report
@@ -166,20 +109,6 @@ def test_figures_of_a_report_are_drawn_as_it_or_the_runs_say(
     assert (place / "figures").exists() == drawn
 
 
-@pytest.mark.parametrize("prints", [True, False])
-def test_a_report_is_printed_for_a_command_alone(
-    prints: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    place = write_sweep(tmp_path / "sweep", ["gaussian"], seeds=(0,))
-    token = PRINTS.set(prints)
-    try:
-        SweepReport(False).on_multirun_end(settings(place))
-    finally:
-        PRINTS.reset(token)
-    table = (place / "table.md").read_text()
-    assert capsys.readouterr().out == f"\n{table}\n  report: {place / 'report.html'}\n" * prints
-
-
 class Gone:
     """A terminal that has gone."""
 
@@ -187,7 +116,7 @@ class Gone:
         raise BrokenPipeError
 
 
-@pytest.mark.parametrize("kind", ["missing", "empty", "full", "no terminal"])
+@pytest.mark.parametrize("kind", ["empty", "full", "no terminal"])
 def test_a_report_that_cannot_be_written_or_read_is_no_sweep_gone_wrong(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -79,9 +79,7 @@ def mapped(plan: Plan, *batches: Batch) -> dict[int, Done]:
         return dict(plan.map(batches, SHOWN))
 
 
-@pytest.mark.parametrize(
-    ("workers", "notes"), [(1, "+a -a +b -b +c -c"), (2, "+a +b -a +c -b -c"), (7, "+a +b +c -a -b -c")]
-)
+@pytest.mark.parametrize(("workers", "notes"), [(1, "+a -a +b -b +c -c"), (2, "+a +b -a +c -b -c")])
 def test_batches_begin_in_order_and_as_many_at_once_as_there_are_workers(workers: int, notes: str) -> None:
     plan = Plan(workers)
     found = mapped(plan, batch("a"), batch("b"), batch("c"))
@@ -137,9 +135,8 @@ def test_an_executor_is_made_by_its_name_or_refused(tmp_path: Path, monkeypatch:
         assert (made.workers, made.pieces) == sizes
     with pytest.raises(ValueError, match=r"executor=\.\.\.\)` must be one of 'inline', 'process'"):
         executor("thread", None, {}, tmp_path)
-    for workers in (0, 1.5):
-        with pytest.raises(ValueError, match=r"`hydra.launcher\(workers=\.\.\.\)` must be"):
-            executor("process", workers, {}, tmp_path)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"`hydra.launcher\(workers=\.\.\.\)` must be"):
+        executor("process", 0, {}, tmp_path)
     for name in ("submitit", "ray"):
         monkeypatch.setitem(sys.modules, name, None)
         with pytest.raises(ValueError, match=rf"executor={name}` needs the extra: pip install 'staf_torch\["):
@@ -204,14 +201,9 @@ def test_an_experiment_without_batches_runs_whole_in_the_worker_and_its_log_come
     assert words(failed) == "NotPicklableError: in our words"
     assert (tmp_path / "0" / "metrics.json").exists()
     assert logging.getLogger().handlers == before
-
-
-@pytest.mark.usefixtures("_as_before")
-def test_a_worker_imports_first_from_where_the_command_does() -> None:
-    before = sys.path[:]
-    sys.path[:] = ["/both", *before]
+    sys.path[:] = ["/both", *(path := sys.path[:])]
     solve_elsewhere(pickle.dumps(Batch([OmegaConf.create({})], ["here"])), ["/theirs", "/both"])
-    assert sys.path == ["/theirs", "/both", *before]
+    assert sys.path == ["/theirs", "/both", *path]  # as the command imports
 
 
 # The libraries, by one small fake each; tests/cluster has the real ones
@@ -294,7 +286,7 @@ def swept(name: str, *more: str) -> staf_torch.sweeps.python_api.Runs:
 
 @pytest.mark.usefixtures("_as_before")
 def test_a_sweep_on_a_cluster_has_the_numbers_of_one_that_is_not(clusters: Clusters) -> None:
-    grid = ["kernel=gaussian,matern", "seed=0,1", "trajectories=2", "hydra.launcher.batch=2"]
+    grid = ["kernel=gaussian,matern", "trajectories=2"]
     expected = [run.metrics for run in swept("inline", *grid)]
     given = ["+hydra.launcher.submitit.mem_gb=3", "+hydra.launcher.ray.num_cpus=2"]
     for name, noted in (("submitit", "job"), ("ray", "task")):
@@ -309,22 +301,12 @@ def test_a_sweep_on_a_cluster_has_the_numbers_of_one_that_is_not(clusters: Clust
     assert len(list(Path("submitit", ".submitit").iterdir())) == 1
 
 
-def test_a_ray_that_cannot_begin_says_why(clusters: Clusters, monkeypatch: pytest.MonkeyPatch) -> None:
-    def init(**_: object) -> None:
-        raise RuntimeError("no\n  port is free")
-
-    monkeypatch.setattr(sys.modules["ray"], "init", init)
-    with pytest.raises(Exception, match=r"Ray could not be started \(RuntimeError: no port is free\)"):
-        swept("ray", "seed=0,1")
-
-
 @pytest.mark.parametrize(
     ("state", "trace", "tries", "said"),
     [
         ("CANCELLED by 0", "", 1, "the worker was lost (SLURM job 1 was cancelled; its log: 1.err)"),
-        ("TIMEOUT", "", 1, "ran into its time limit: give it more by hydra.launcher.submitit.timeout_min"),
-        ("OUT_OF_MEMORY", "", 1, "too little memory: give it more by hydra.launcher.submitit.mem_gb"),
         ("NODE_FAIL", "", 2, "lost twice (SLURM job 2 ended without a result (NODE_FAIL); its log: 2.err)"),
+        ("OUT_OF_MEMORY", "", 1, "too little memory: give it more by hydra.launcher.submitit.mem_gb"),
         ("FAILED", "Traceback\nMemoryError: no more", 2, "SLURM job 2 MemoryError: no more; its log: 2.err"),
         ("FAILED", "UncompletedJobError: timed-out and not checkpointable", 1, "ran into its time limit"),
     ],

@@ -31,7 +31,7 @@ from staf_torch.sweeps.lock import DirectoryLock
 SHORT = ("duration=0.1", "settle_time=0.05")
 notebook = operator.methodcaller("_repr_html_")
 BARE = (*SHORT, "figures=false", "history=false")
-SWEPT = ("kernel=gaussian,matern", "centers.radius=0.2,0.1", *BARE)
+SWEPT = ("kernel=gaussian,matern", *BARE)
 
 
 @pytest.fixture(autouse=True)
@@ -108,10 +108,10 @@ def test_a_sweep_is_that_of_the_command_and_shows_nothing(
     two = commands["sweep"].folder / "two"
     assert Path("one/table.csv").read_bytes() == (two / "table.csv").read_bytes()
     assert {path.name for path in Path("one").iterdir()} == {path.name for path in two.iterdir()}
-    assert repr(found) == "<Runs 4 completed, over kernel, centers.radius>"
+    assert repr(found) == "<Runs 2 completed, over kernel>"
     best = found.best("ball_error")
     assert best.metrics["ball_error"] == min(run.metrics["ball_error"] for run in found)
-    assert len(staf_torch.read_runs(two)) == 4
+    assert len(staf_torch.read_runs(two)) == 2
     assert list(best.figures()) == ["gradient_chase"]  # the run drew none: drawn anew
     assert not (best.directory / "figures").exists()
 
@@ -121,11 +121,9 @@ def test_a_sweep_is_that_of_the_command_and_shows_nothing(
     ("lines", "words"),
     [
         (["centers.radius=-1"], "must be positive; got -1"),
-        (["centers.radios=1"], "there is no setting `centers.radios`"),
         (["kernel=gauss"], "there is no `kernel/gauss`; there are anchored"),
         (["centers.radius=0.1,0.2"], "a list is a sweep"),
         (["experiment=ablation"], "call `staf_torch.sweep`"),
-        (["target.path=nowhere.function", "target=custom"], "nowhere"),
     ],
 )
 def test_what_a_user_got_wrong_is_a_value_error(lines: list[str], words: str) -> None:
@@ -174,8 +172,6 @@ def test_a_run_has_its_directory_to_itself_and_replaces_no_other_command() -> No
         ValueError, match=r"one holds the run 'seed=1 .*', which this run would .*`hydra.run.dir`"
     ):
         staf_torch.run(*BARE, "seed=2", directory="one")
-    with pytest.raises(ValueError, match=r"one holds a run, .*`hydra.sweep.dir`"):
-        staf_torch.sweep(*BARE, "seed=2,3", directory="one")
     other = DirectoryLock(Path("one"), "run")
     with pytest.raises(
         ValueError, match=rf"belongs to a run that goes on: process {os.getpid()} .*`hydra.run.dir`"
@@ -214,26 +210,19 @@ def test_a_data_frame_over_kernel_radius_and_count_in_three_lines() -> None:
     pandas = pytest.importorskip("pandas")
     from staf_torch import sweep
 
-    runs = sweep("kernel=gaussian,matern", "centers.count=3,7", "seed=0,1", *BARE)
-    frame = runs.pivot("kernel", ["centers.count", "seed"], "ball_error")
+    runs = sweep("kernel=gaussian,matern", "centers.count=3,7", *BARE)
+    frame = runs.pivot("kernel", ["centers.count"], "ball_error")
     assert isinstance(frame, pandas.DataFrame)
-    assert frame.loc["matern", (3, 1)] == runs[5].metrics["ball_error"]
+    assert frame.loc["matern", 3] == runs[2].metrics["ball_error"]
     assert frame[7].isna().all().all()  # a layout that there is not
     with pytest.raises(ValueError, match=r"`Runs.best\(metric=...\)` must be one of ; got"):
         runs.filter("centers.count=7").best("ball_error")
 
 
-def test_tables_for_pandas_name_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    runs = staf_torch.sweep(*BARE)
-    monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(ValueError, match="a DataFrame needs pandas: install the extra `tables`"):
-        runs.to_pandas()
-
-
 def test_memory_is_flat_over_sweeps() -> None:
     counts = []
     for _ in range(3):
-        staf_torch.sweep("seed=range(2)", "trajectories=2", *BARE)
+        staf_torch.sweep("seed=0,1", *BARE)
         gc.collect()
         counts.append(len(gc.get_objects()))
     assert counts[2] < 1.01 * counts[1] + 100  # Python 3.13 names its youngest objects alone

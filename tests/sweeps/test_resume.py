@@ -30,34 +30,15 @@ def lines(place: Path, *argv: str) -> list[str]:
     return command_line([*argv, f"sweep.resume={place}"])
 
 
-def test_a_command_line_that_resumes_nothing_stays_as_it_is(tmp_path: Path) -> None:
-    for argv in (
-        [],
-        ["seed=1"],
-        ["-m", "sweep.resume=null", "seed=0"],
-        [f"sweep.resume={tmp_path}", "sweep.resume=null"],
-    ):
+def test_the_last_directory_that_is_named_is_resumed_and_else_a_line_stays_as_it_is(tmp_path: Path) -> None:
+    for argv in ([], ["-m", "seed=1"], [f"sweep.resume={tmp_path}", "sweep.resume=null"]):
         assert command_line(argv) == argv
-    place = sweep(tmp_path)
-    assert command_line(["sweep.resume=null", f"sweep.resume={place}"]) == [
-        "--multirun",
-        "seed=0,1",
-        *end(place),
-    ]
-
-
-def test_the_last_directory_that_is_named_counts_and_quotes_are_the_shells(tmp_path: Path) -> None:
     (tmp_path / "one").mkdir()
     place = sweep(tmp_path / "one")
     for quote in "'\"":
         line = ["sweep.resume=nowhere", f"sweep.resume={quote}{place}/../one/{quote}"]
         assert command_line(line) == ["--multirun", "seed=0,1", *end(place)]
-
-
-def test_flags_stay_and_a_sweep_is_one(tmp_path: Path) -> None:
-    place = sweep(tmp_path)
-    for flags in (["-m"], ["--multirun"], ["-m", "--config-dir=conf"]):
-        assert lines(place, *flags) == [*flags, "seed=0,1", *end(place)]
+    assert lines(place, "-m", "--config-dir=conf") == ["-m", "--config-dir=conf", "seed=0,1", *end(place)]
 
 
 def test_overrides_that_are_repeated_are_those_of_the_sweep_in_any_order(tmp_path: Path) -> None:
@@ -70,7 +51,6 @@ def test_overrides_that_are_repeated_are_those_of_the_sweep_in_any_order(tmp_pat
             ["seed=0,1"],
             "without 'kernel=gaussian'. Only .*figures.* The sweep is: staf -m seed=0,1 kernel=gaussian$",
         ),
-        (["seed=0,1", "kernel=gaussian", "dt=1", "spread=2"], "with 'dt=1 spread=2'. Only"),
         (["kernel=matern", "seed=0,1"], "without 'kernel=gaussian' and with 'kernel=matern'. Only"),
         (["seed=0,1", "kernel=gaussian", "seed=0,1"], "more than once. Only"),
     ):
@@ -120,7 +100,7 @@ def test_settings_that_change_no_number_may_be_others(tmp_path: Path) -> None:
         lines(place, "seed=0,1", "figures=true,false")
 
 
-@pytest.mark.parametrize("record", [None, "[]", '{"overrides": []}', '{"hydra": []}', "damaged"])
+@pytest.mark.parametrize("record", [None, "[]", '{"overrides": []}', "damaged"])
 def test_what_is_no_sweep_is_refused(record: str | None, tmp_path: Path) -> None:
     if record is not None:
         (tmp_path / "sweep.json").write_text(record)
@@ -128,7 +108,7 @@ def test_what_is_no_sweep_is_refused(record: str | None, tmp_path: Path) -> None
         ValueError, match=rf"must be the directory of a sweep, with its sweep.json; got '{tmp_path}'"
     ):
         lines(tmp_path)
-    for spoilt in ({"overrides": "seed=1"}, {"overrides": [1]}, {"hydra": ["a", None]}, {"hydra": {"a": 1}}):
+    for spoilt in ({"overrides": "seed=1"}, {"hydra": ["a", None]}):
         with pytest.raises(ValueError, match="must be the directory of a sweep"):
             recorded(sweep(tmp_path, **spoilt), anyway=True)  # type: ignore[arg-type]
 
@@ -139,35 +119,8 @@ def test_a_sweep_of_another_version_is_resumed_where_a_person_means_it(tmp_path:
         ValueError, match=rf"of this version \({__version__}\).*was written by 0.0.1x{{75}}\."
     ):
         lines(place)
-    with pytest.raises(ValueError, match="was written by"):
-        recorded(place)
     anyway = "sweep.resume_anyway=true"
     assert lines(place, anyway) == ["--multirun", "seed=0,1", anyway, *end(place)]
-    assert lines(sweep(tmp_path), anyway) == ["--multirun", "seed=0,1", anyway, *end(place)]
-    assert recorded(place) == (["seed=0,1"], [])
-
-
-def test_lines_of_ten_thousand_characters_are_read_unasked(tmp_path: Path) -> None:
-    def of(length: int) -> list[str]:
-        return [f"+note={'x' * (length - 12)}", "seed=1"]
-
-    hydra = ["hydra.verbose=true"]
-    place = sweep(tmp_path, of(10_000 - len(hydra[0])), hydra)
-    assert len(lines(place)) == 6
-    sweep(tmp_path, of(10_001 - len(hydra[0])), hydra)
-    with pytest.raises(
-        ValueError, match=f"{place} was started with lines of 10001 characters, and 10000 are"
-    ):
-        lines(place)
-    assert len(lines(place, "--trust")) == 6
-    assert len(lines(place, *of(10_001 - len(hydra[0])))) == 6  # who types them knows them
-
-
-def test_a_sweep_of_a_million_jobs_is_resumed_and_no_larger_one(tmp_path: Path) -> None:
-    assert lines(sweep(tmp_path, ["seed=range(1000000)"]))
-    with pytest.raises(ValueError, match=rf"{tmp_path} has a sweep of 1e\+06 jobs, and 1000000 are the most"):
-        lines(sweep(tmp_path, ["seed=range(1000001)"]))
-    assert lines(sweep(tmp_path, ["seed=range(1000001"]))  # Hydra says what is wrong with it
 
 
 # Code of somebody else
@@ -190,7 +143,7 @@ class Terminal(io.StringIO):
 FOREIGN = ["kernel.path=evil.Kernel", "hydra.callbacks.a._target_=evil"]
 
 
-@pytest.mark.parametrize("answer", ["y\n", " YES \n", "n\n", "\n", "", "yess\n"])
+@pytest.mark.parametrize("answer", [" YES \n", "\n", "yess\n"])
 def test_somebody_at_a_terminal_is_asked_whether_lines_may_run(
     answer: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -199,7 +152,7 @@ def test_somebody_at_a_terminal_is_asked_whether_lines_may_run(
     monkeypatch.setattr(sys, "stdin", Terminal(answer))
     monkeypatch.setattr(sys, "stderr", err)
     shown = f"\n  {FOREIGN[0]}\n  {FOREIGN[1]}\n"
-    if answer in ("y\n", " YES \n"):
+    if answer == " YES \n":
         assert lines(place) == ["--multirun", FOREIGN[0], "seed=1", FOREIGN[1], *end(place)]
     else:
         with pytest.raises(ValueError, match="may run code of whoever started it") as told:
@@ -208,16 +161,3 @@ def test_somebody_at_a_terminal_is_asked_whether_lines_may_run(
         assert str(told.value).endswith("If you know them, repeat them, or add --trust.")
     question = f"staf: {place} was started with lines that may run code:{shown}Run them? [y/N] "
     assert err.getvalue() == err.flushed == question
-
-
-@pytest.mark.parametrize("absent", ["no input", "input", "errors"])
-def test_nobody_is_asked_where_there_is_no_terminal(
-    absent: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    place, err = sweep(tmp_path, FOREIGN[:1]), Terminal("", absent != "errors")
-    monkeypatch.setattr(sys, "stdin", None if absent == "no input" else Terminal("y\n", absent != "input"))
-    monkeypatch.setattr(sys, "stderr", err)
-    with pytest.raises(ValueError, match="may run code of whoever started it"):
-        lines(place)
-    assert err.getvalue() == ""
-    assert lines(place, "--trust") == lines(place, FOREIGN[0]) == ["--multirun", FOREIGN[0], *end(place)]

@@ -9,15 +9,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-import worker_tasks
 
 from staf_torch.sweeps.workers import (
     Stopped,
-    Worker,
     beginning,
     check,
     name_and_code,
-    ready,
     stopped_by_signals,
     what_ended,
 )
@@ -88,35 +85,13 @@ def test_a_child_of_a_fork_ends_by_the_signal_itself() -> None:
         assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGTERM
 
 
-@pytest.mark.parametrize(
-    ("error", "said"),
-    [
-        (KeyboardInterrupt(), ("interrupted", 130)),
-        (Stopped(signal.SIGINT), ("interrupted", 130)),
-        (Stopped(signal.SIGTERM), ("ended by SIGTERM", 143)),
-        (Stopped(signal.SIGHUP), ("ended by SIGHUP", 129)),
-    ],
-)
-def test_a_signal_has_a_name_and_the_code_of_shells(error: KeyboardInterrupt, said: tuple[str, int]) -> None:
-    assert name_and_code(error) == said
+def test_a_signal_has_a_name_and_the_code_of_shells() -> None:
+    assert name_and_code(KeyboardInterrupt()) == ("interrupted", 130)
+    assert name_and_code(Stopped(signal.SIGINT)) == ("interrupted", 130)
+    assert name_and_code(Stopped(signal.SIGTERM)) == ("ended by SIGTERM", 143)
 
 
 def test_a_beginning_tells_a_process_from_a_later_one_of_its_number() -> None:
     began = Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19]  # field 22 of proc(5)
     assert beginning(os.getpid()) == began
     assert beginning(2**22 + 1) == ""  # more than there can be
-
-
-def test_workers_compute_side_by_side_and_one_that_was_ended_is_found_by_its_result(tmp_path: Path) -> None:
-    workers = {number: Worker(worker_tasks.work) for number in range(2)}
-    for number, worker in workers.items():
-        worker.begin(f"done {number}", str(tmp_path / str(number)))
-    waiting = dict(workers)
-    while waiting:
-        for number in ready(waiting):
-            assert waiting.pop(number).result() == f"done {number}".encode()
-    assert all(worker.alive() for worker in workers.values())
-    for worker in workers.values():
-        worker.end()
-        worker.begin("more", "nowhere")  # found by `result`
-        assert not worker.alive()

@@ -48,11 +48,14 @@ def test_rows_are_what_the_same_sweep_leaves_in_directories() -> None:
     names = {path.name for path in Path("one").iterdir()}
     report = {"table.md", "table.tex", "table.csv", "report.html"}
     assert names == report | {"sweep.json", "multirun.yaml", "run.json", "rows.json"}
+    for change in (("many", TABLE), ("one", "sweep.records=directories")):
+        with pytest.raises(ValueError, match="which a sweep keeps"):
+            staf_torch.sweep(f"sweep.resume={change[0]}", change[1])
 
 
 def test_failed_and_diverged_rows_are_named_and_the_others_go_on() -> None:
     lists = ["centers.radius=0.1,-1", "initial_state=[1.0,0.0],[90.0,90.0]"]
-    lines = [*lists, "system=van_der_pol", "dt=0.2", "duration=20", "settle_time=0.5", "figures=false"]
+    lines = [*lists, "system=van_der_pol", "dt=0.2", "duration=8", "settle_time=0.5", "figures=false"]
     code, out, err = one(".", ["-m", TABLE, *lines, "hydra.sweep.dir=one"])
     rows = rows_of("one")
     assert [row["status"] for row in rows] == ["completed", "completed", "failed", "failed"]
@@ -60,14 +63,14 @@ def test_failed_and_diverged_rows_are_named_and_the_others_go_on() -> None:
     assert (rows[2]["reason"], rows[2]["metrics"]) == (wrong, {})
     assert rows[1]["metrics"]["ultimate_error"] is None
     assert "2 of 4 jobs completed, 2 failed" in out
-    assert "job 2 (centers.radius=-1 initial_state=[1.0,0.0] system=van_der_pol" in err
+    assert "job 2 (centers.radius=-1 initial_state=[1.0,0.0]" in err
     assert (code, err.splitlines()[-1].endswith(wrong)) == (1, True)
 
 
 def test_rows_keep_a_history_only_where_it_is_asked_for() -> None:
     staf_torch.sweep(*SHORT, "seed=1,2", "history=true", TABLE, directory="one")
-    found = sorted(str(path) for path in Path("one").rglob("history.npz"))
-    assert found == ["one/rows/0/history.npz", "one/rows/1/history.npz"]
+    kept = sorted(str(path) for path in Path("one").rglob("history.npz"))
+    assert kept == ["one/rows/0/history.npz", "one/rows/1/history.npz"]
 
 
 def alone(cfg: Any, directory: Path, progress: object = None) -> dict[str, float]:
@@ -87,33 +90,29 @@ def test_experiments_without_batches_run_one_by_one() -> None:
 @pytest.mark.parametrize(
     ("line", "words"),
     [
-        ("sweep.records=tables", "`staf sweep.records=...` must be one of 'directories', 'table'"),
-        (f"{TABLE} hydra/launcher=basic", "needs a sweep (staf -m) whose launcher is hydra/launcher=batched"),
-        (f"{TABLE} hydra.sweeper.max_batch_size=1", "needs all jobs at once"),
-        (f"{TABLE} centers.raduis=0.1,0.2", "there is no setting `centers.raduis`"),
-        (f"{TABLE} seed=range(1000001)", "a sweep of 2e+06 jobs, and 1000000 are the most"),
+        ("-m sweep.records=tables", "`staf sweep.records=...` must be one of 'directories', 'table'"),
+        (f"-m {TABLE} hydra/launcher=basic", "needs a sweep (staf -m) whose launcher is"),
+        (f"-m {TABLE} hydra.sweeper.max_batch_size=1", "needs all jobs at once"),
+        (f"-m {TABLE} seed=range(1000001)", "a sweep of 2e+06 jobs, and 1000000 are the most"),
+        (TABLE, "needs a sweep (staf -m)"),
     ],
 )
 def test_what_has_no_table_is_refused_in_a_sentence(line: str, words: str) -> None:
-    code, _, err = one(".", ["-m", *SHORT, "trajectories=1,2", *line.split(), "hydra.sweep.dir=one"])
+    swept = ["trajectories=1,2", "hydra.sweep.dir=one"] if line.startswith("-m") else []
+    code, _, err = one(".", [*line.split(), *SHORT, *swept])
     assert code == 1
     assert words in err
     assert not Path("one", "rows.json").exists()
-
-
-def test_a_single_run_has_no_table() -> None:
-    code, _, err = one(".", [*SHORT, TABLE])
-    assert (code, "needs a sweep (staf -m)" in err) == (1, True)
 
 
 # Killed, and taken up again
 
 MINE = '''
 import dataclasses
-import os
 from pathlib import Path
 from staf_torch.experiments.registry import BatchedExperiment
 from staf_torch.settings.plain import to_read
+from staf_torch.sweeps.workers import LostError
 
 SCALE = 1.0
 
@@ -122,33 +121,33 @@ class Square:
     metrics: dict
 
 class Squares(BatchedExperiment[Square]):
-    """Squares of a number; notes what it computes, and ends at the number in the file `stop` or `die`."""
+    """Squares of a number; notes what it computes, ends at the number in the file `stop`, loses others."""
     batchable = frozenset({"seed", "trajectories"})
 
     def solve(self, cfgs, progress):
         cfgs = to_read(cfgs)
-        numbers = [50 * cfg.seed + cfg.trajectories for cfg in cfgs]
+        numbers = [40 * cfg.seed + cfg.trajectories for cfg in cfgs]
         if Path("stop").exists() and int(Path("stop").read_text()) in numbers:
             Path("stop").unlink()
             raise KeyboardInterrupt
-        if Path("die").exists() and int(Path("die").read_text()) in numbers:
-            os._exit(3)
         with open("computed", "a") as file:
             file.write("".join(f"{number}\\n" for number in numbers))
-        width = cfgs[0].kernel.width
-        return [Square({"square": SCALE * width * number**2}) for number in numbers]
+        scale, lost = SCALE * cfgs[0].kernel.width, Path("lose").exists()
+        return [LostError("gone") if lost and n > 42 else Square({"square": scale * n**2}) for n in numbers]
 
     def __call__(self, cfg, directory, progress=None):
         return self.write(cfg, directory, self.solve([cfg], progress)[0])
 
     def write(self, cfg, directory, solution):
-        if cfg.history and 50 * cfg.seed + cfg.trajectories >= 1000:  # of some rows: files take time
+        if cfg.history:
             (directory / "history.npz").write_text(f"{solution.metrics['square']:.0f}"[:1])
         return solution.metrics
 '''
 PARTIAL, SUMS = ".rows.json.partial", ".rows.json.sums"
-PIECE, BATCH, ALL = 1024, 128, 1100  # rows that are written together, that are computed together, and all
-GRID = ["-m", TABLE, "task=mine.Squares", "kernel=choice(own)", "seed=range(22)", "trajectories=range(50)"]
+PIECE, BATCH, ALL = 1024, 128, 1040  # rows that are written together, that are computed together, and all
+OWN = ["-m", TABLE, "task=mine.Squares", "kernel=choice(own)"]
+GRID = [*OWN, "seed=range(26)", "trajectories=range(40)"]
+FEW = [*OWN, "seed=range(2)", "trajectories=range(4)", "history=true", "hydra.sweep.dir=lost"]
 
 
 def staf(*argv: str) -> tuple[int, str]:
@@ -167,7 +166,7 @@ def computed() -> list[int]:
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a user's experiment and kernel, a whole run, one killed in its second piece."""
+    """A folder with a user's experiment and kernel, runs that are whole, killed and with a lost row."""
     place = tmp_path_factory.mktemp("rows")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(place)
@@ -184,6 +183,10 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         assert code == 130
         Path("said").write_text(said)
         assert computed() == list(range(PIECE))
+        Path("lose").touch()
+        assert staf(*FEW)[0] == 1
+        computed()
+        Path("lose").unlink()
     return place
 
 
@@ -216,64 +219,45 @@ def test_many_rows_are_reported_as_the_spread_of_each_metric(runs: Path) -> None
     assert "<dt>trajectories</dt>" not in page
 
 
-def lines_of(name: str) -> list[bytes]:
-    return Path("killed", name).read_bytes().splitlines(keepends=True)
-
-
-def cut_in_a_row(number: int) -> None:
-    """A row ends in its middle, and what comes after is gone."""
-    lines = lines_of(PARTIAL)
-    Path("killed", PARTIAL).write_bytes(b"".join(lines[: number + 1]) + lines[number + 1][:40])
-
-
-def flip_a_digit(number: int) -> None:
-    lines = lines_of(PARTIAL)
-    at = max(n for n, letter in enumerate(lines[number + 1]) if chr(letter).isdigit())
-    lines[number + 1] = lines[number + 1][:at] + b"x" + lines[number + 1][at + 1 :]
-    Path("killed", PARTIAL).write_bytes(b"".join(lines))
-
-
-def lose_everything(number: int) -> None:
-    Path("killed", PARTIAL).unlink()
-
-
-DAMAGE: dict[str, tuple[Any, int]] = {  # what is done, and the first row that is not whole then
-    "a cut row": (cut_in_a_row, 900),
-    "another digit": (flip_a_digit, 3),
-    "everything": (lose_everything, 0),
-}
-
-
-@pytest.mark.parametrize("name", DAMAGE)
-def test_a_resumed_job_computes_what_is_missing_and_ends_with_the_same_bytes(name: str, place: Path) -> None:
-    spoil, first = DAMAGE[name]
-    spoil(first)
+def test_a_resumed_job_computes_what_is_missing_and_ends_with_the_same_bytes(place: Path) -> None:
+    first, partial = 900, Path("killed", PARTIAL)  # the first row that is not whole: it has another digit
+    lines = partial.read_bytes().splitlines(keepends=True)
+    at = max(n for n, letter in enumerate(lines[first + 1]) if chr(letter).isdigit())
+    lines[first + 1] = lines[first + 1][:at] + b"x" + lines[first + 1][at + 1 :]
+    partial.write_bytes(b"".join(lines[:950]) + lines[950][:40])  # a row is cut, and what comes after is gone
     code, said = staf("-m", "sweep.resume=killed", "--trust")
     assert code == 0, said
-    assert ("and those after it run again" in said) == (name != "everything")
-    batch = first - first % PIECE % BATCH  # which is computed as a whole, as it was then
-    assert computed() == list(range(batch, ALL))
+    assert "and those after it run again" in said
+    assert computed() == list(range(first - first % BATCH, ALL))  # a batch as a whole, as it was then
     for file in ("rows.json", "table.md"):
         assert Path("killed", file).read_bytes() == Path("whole", file).read_bytes()
     assert not list(Path("killed").glob(".rows*"))
+    before = Path("killed/rows.json").stat().st_mtime_ns
+    code, said = staf("-m", "sweep.resume=killed", "--trust")  # it is complete
+    assert (code, computed()) == (0, []), said
+    assert f"{ALL} of {ALL} jobs completed, 0 failed" in said
+    assert Path("killed/rows.json").stat().st_mtime_ns == before
 
 
 def test_a_history_belongs_to_its_row_and_one_that_is_damaged_is_made_again(place: Path) -> None:
-    Path("stop").write_text(str(PIECE + 5))
-    assert staf(*GRID, "history=true", "hydra.sweep.dir=kept")[0] == 130
-    computed()
-    spoiled = Path("kept/rows/1020/history.npz")
-    assert spoiled.read_text() == "1"
+    spoiled = Path("lost/rows/2/history.npz")
+    assert spoiled.read_text() == "6"
     spoiled.write_text("8")  # of the same size
-    code, said = staf("-m", "sweep.resume=kept", "--trust")
+    code, said = staf("-m", "sweep.resume=lost", "--trust")
     assert code == 0, said
     assert "history.npz is damaged" in said
-    assert spoiled.read_text() == "1"
-    assert computed() == list(range(1020 - 1020 % BATCH, ALL))
+    assert spoiled.read_text() == "6"
+
+
+def test_rows_that_lost_their_workers_are_computed_later_and_the_others_stay(place: Path) -> None:
+    assert collect("lost").rows[-1].reason == "1 of 8 rows lost their workers; sweep.resume computes them"
+    code, said = staf("-m", "sweep.resume=lost", "--trust")
+    assert code == 0, said
+    assert [row["metrics"]["square"] for row in rows_of("lost")][-2:] == [1.5 * 42**2, 1.5 * 43**2]
 
 
 def test_rows_of_other_settings_or_modules_are_refused_and_stay(place: Path) -> None:
-    rows = Path("killed", PARTIAL).read_bytes()
+    rows = Path("lost", PARTIAL).read_bytes()
     for path, before, after, words in (
         (
             "conf/kernel/own.yaml",
@@ -285,49 +269,13 @@ def test_rows_of_other_settings_or_modules_are_refused_and_stay(place: Path) -> 
     ):
         text = Path(path).read_text()
         Path(path).write_text(text.replace(before, after))
-        code, said = staf("-m", "sweep.resume=killed", "--trust")
+        code, said = staf("-m", "sweep.resume=lost", "--trust")
         assert code == 1
         assert words in said
         assert computed() == []
-        assert Path("killed", PARTIAL).read_bytes() == rows
+        assert Path("lost", PARTIAL).read_bytes() == rows
         if path != "mine.py":
             Path(path).write_text(text)
-    code, said = staf("-m", "sweep.resume=killed", "sweep.resume_anyway=true", "--trust")
+    code, said = staf("-m", "sweep.resume=lost", "sweep.resume_anyway=true", "--trust")
     assert code == 0, said
-    assert computed() == list(range(ALL))  # the sweep begins anew where a person means it
-    assert rows_of("killed")[2]["metrics"]["square"] == 12.0
-
-
-def test_a_complete_table_is_not_computed_again(place: Path) -> None:
-    before = Path("whole/rows.json").stat().st_mtime_ns
-    code, said = staf("-m", "sweep.resume=whole", "--trust")
-    assert (code, computed()) == (0, []), said
-    assert f"{ALL} of {ALL} jobs completed, 0 failed" in said
-    assert Path("whole/rows.json").stat().st_mtime_ns == before
-
-
-def test_a_sweep_does_not_change_between_rows_and_directories(place: Path) -> None:
-    code, said = staf("-m", "sweep.resume=killed", "sweep.records=directories", "--trust")
-    assert (code, "which a sweep keeps" in said) == (1, True)
-    staf_torch.sweep(*SHORT, "seed=1,2", "history=false", directory="many")
-    code, said = staf("-m", "sweep.resume=many", TABLE)
-    assert (code, "which a sweep keeps" in said) == (1, True)
-
-
-def test_workers_leave_the_same_rows_and_those_that_are_lost_are_computed_later(place: Path) -> None:
-    workers = ["hydra.launcher.executor=process", "hydra.launcher.workers=1"]
-    Path("die").write_text(str(PIECE + 5))
-    code, said = staf(*GRID, *workers, "hydra.sweep.dir=lost")
-    assert code == 1
-    assert f"{ALL - PIECE} of {ALL} rows lost their workers" in said
-    assert "the worker was lost twice (it ended with exit code 3)" in said
-    assert {run.status for run in collect("lost").rows[:PIECE]} == {"completed"}
-    assert computed() == list(range(PIECE))
-    Path("die").unlink()
-    here = "hydra.launcher.executor=inline"  # as any sweep that was killed between two pieces
-    code, said = staf("-m", "sweep.resume=lost", TABLE, "tracker=none", here, "--trust")
-    assert code == 0, said
-    assert computed() == list(range(PIECE, ALL))
-    for file in ("rows.json", "table.md"):
-        assert Path("lost", file).read_bytes() == Path("whole", file).read_bytes()
-    assert not list(Path("lost").glob(".rows*"))
+    assert rows_of("lost")[2]["metrics"]["square"] == 12.0  # the sweep begins anew where a person means it

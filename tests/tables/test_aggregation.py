@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from scipy.stats import t as student
-from sweep_runs import BAD_COUNT, error, write_run, write_sweep
+from sweep_runs import BAD_COUNT, error, write_sweep
 
 from staf_torch.results.reader import Collection, RecordedRun, collect
 from staf_torch.results.run import MetricInfo
@@ -51,17 +51,6 @@ def shown(table: Table) -> list[tuple[str, str]]:
     return [(column.over, column.heading) for column in table.printed()]
 
 
-def test_without_wishes_a_row_is_a_run(found: Collection) -> None:
-    table = tabulate(found)
-    assert len(table.rows) == 36
-    assert table.names[:4] == ("kernel", "centers.radius", "centers.count", "seed")
-    assert "reason" in table.names
-    failed = [row for row in table.rows if row.cells["status"] == "failed"]
-    assert len(failed) == 12
-    assert all(row.cells["ball_error"] is None for row in failed)
-    assert {row.reasons["ball_error"] for row in failed} == {BAD_COUNT}
-
-
 def test_aggregates_are_over_what_is_in_neither_rows_nor_columns(found: Collection) -> None:
     layout = Layout(**{**PIVOT.__dict__, "aggregates": tuple(AGGREGATES)})
     table = tabulate(found, layout)
@@ -85,20 +74,6 @@ def test_aggregates_are_over_what_is_in_neither_rows_nor_columns(found: Collecti
     assert row["reasons"] == BAD_COUNT
 
 
-def test_a_group_in_which_some_runs_failed_says_of_how_many(tmp_path: Path) -> None:
-    write_run(tmp_path / "0", {"seed": 0}, {"ball_error": 1.0})
-    write_run(tmp_path / "1", {"seed": 1}, {"ball_error": None})
-    write_run(tmp_path / "2", {"seed": 2}, None, status="failed", reason="why")
-    (row,) = tabulate(collect(tmp_path), Layout(aggregates=("mean", "std"))).rows
-    assert (row.cells["ball_error.mean"], row.cells["ball_error.n"], row.cells["ball_error.failed"]) == (
-        1.0,
-        1,
-        2,
-    )
-    assert row.cells["ball_error.std"] is None
-    assert row.cells["reasons"] == "not finite, or nothing to report; why"
-
-
 @pytest.mark.parametrize("option", ["rows", "columns", "metrics", "aggregates", "sort"])
 def test_an_unknown_name_is_refused_with_those_that_exist(option: str, found: Collection) -> None:
     with pytest.raises(ValueError, match=r"must be one of .*; got 'ball_eror'") as raised:
@@ -115,26 +90,6 @@ def test_the_last_part_of_a_name_finds_the_whole(found: Collection) -> None:
 @pytest.mark.parametrize("freedom", [1, 2, 3, 10, 99, 100, 199, 200, 201, 300, 1000, 10**6])
 def test_quantile_of_students_t_is_exact(freedom: int) -> None:
     assert student_quantile(freedom) == pytest.approx(student.ppf(0.975, freedom), rel=1e-10)
-
-
-@pytest.mark.parametrize(
-    ("more", "about"),
-    [
-        ({}, ["status", "directory"]),
-        ({"reason": "why"}, ["status", "reason", "directory"]),
-        ({"status": "failed"}, ["status", "reason", "directory"]),
-        ({"row": 0}, ["status", "directory", "row"]),
-    ],
-)
-def test_a_table_of_runs_says_what_of_a_run_is_worth_it(more: dict[str, Any], about: list[str]) -> None:
-    table = tabulate(of(run(0, {"cost": 1.0}, a=1), run(1, {"cost": 2.0}, a=2, **more)))
-    assert names(table) == ["a", "cost", *about]
-    assert [(column.metric, column.shown) for column in table.columns[:2]] == [(None, True), ("cost", True)]
-    headings = [heading for _, heading in shown(table)]
-    assert "directory" not in headings
-    assert ("status" in headings) is ("status" in more)
-    assert table.rows[1].cells["directory"] == "/runs/1"
-    assert table.rows[1].cells.get("row") == more.get("row")
 
 
 def test_headlines_are_ours_in_their_order_then_those_of_ones_own_else_the_first_six_metrics() -> None:
