@@ -46,13 +46,13 @@ def test_a_state_of_ones_own_is_carried_row_by_row_and_recorded_by_name(
     x0 = torch.randn(18, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     x0[4] = torch.nan
     runs = [
-        adp.simulate(Hysteresis(), TWO_STATE, COST, x0, dt=0.02, steps=100, compile=compile)
+        adp.simulate(Hysteresis(), TWO_STATE, COST, x0, dt=0.05, steps=40, compile=compile)
         for compile in (True, False)
     ]
     assert not caplog.text
     torch.testing.assert_close(runs[0].state, runs[1].state, rtol=1e-10, atol=1e-10, equal_nan=True)
     assert runs[0].diverged.tolist() == [row == 4 for row in range(18)]
-    assert runs[0].critic_weights.shape == (18, 101, 0)
+    assert runs[0].critic_weights.shape == (18, 41, 0)
     assert torch.equal(runs[0]["switches"], runs[1]["switches"])
     assert torch.equal(runs[0]["before"][:4, 2:-1], runs[0].state[:4, 1:-2])
     torch.testing.assert_close(runs[0].carried, runs[1].carried, rtol=1e-10, atol=1e-10, equal_nan=True)
@@ -61,7 +61,7 @@ def test_a_state_of_ones_own_is_carried_row_by_row_and_recorded_by_name(
     assert torch.equal(first.carried["mode"], runs[0].carried["mode"][:5])
     with pytest.raises(KeyError, match="records switches, before; got 'weights'"):
         runs[0]["weights"]
-    alone = adp.simulate(Hysteresis(), TWO_STATE, COST, x0[2:11], dt=0.02, steps=100, compile=True)
+    alone = adp.simulate(Hysteresis(), TWO_STATE, COST, x0[2:11], dt=0.05, steps=40, compile=True)
     assert torch.equal(alone.state[0], runs[0].state[2])
     assert torch.equal(alone.state[3:], runs[0].state[5:11])
 
@@ -90,27 +90,6 @@ def test_what_is_carried_keeps_its_form(initial: Any, after: Any, message: str) 
     x0 = torch.ones(3, 2, dtype=torch.float64)
     with pytest.raises(ValueError, match=message):
         adp.simulate(Misfit(initial, after), TWO_STATE, COST, x0, dt=0.1, steps=2)
-
-
-@pytest.mark.parametrize("shape", [(3,), (3, 2), (1,)])
-def test_a_control_of_another_shape_is_refused(shape: tuple[int, ...]) -> None:
-    class Odd(adp.Controller):
-        def init(self, x0: Tensor) -> Any:
-            return ()
-
-        def step(self, x: Tensor, carried: Any, uniform: Tensor, dt: float) -> tuple[Tensor, Any]:
-            return torch.zeros(shape, dtype=x.dtype), carried
-
-    with pytest.raises(ValueError, match=r"\(3, 1\)"):
-        adp.simulate(Odd(), TWO_STATE, COST, torch.ones(3, 2, dtype=torch.float64), dt=0.1, steps=2)
-
-
-def test_a_function_of_the_state_is_a_controller() -> None:
-    policy = lambda x: -3.0 * x[..., 1:]  # noqa: E731
-    one, other = (
-        adp.simulate(each, TWO_STATE, COST, X0, steps=20) for each in (policy, adp.Feedback(policy))
-    )
-    assert torch.equal(one.state, other.state)
 
 
 def test_a_feedback_has_the_name_the_period_and_the_value_of_its_policy() -> None:
@@ -145,8 +124,9 @@ class Integral(nn.Module):
         return -3 * x[:, 1:] - self.total
 
 
-@pytest.mark.parametrize("buffer", [False, True])
-@pytest.mark.parametrize("way", ["another tensor", "in place", ".data"])
+@pytest.mark.parametrize(
+    ("way", "buffer"), [("another tensor", False), ("in place", True), (".data", False), (".data", True)]
+)
 def test_a_policy_with_a_memory_is_refused(way: str, buffer: bool) -> None:
     policy = adp.Feedback(Integral(way, buffer))
     with pytest.raises(ValueError, match=r"changed its `total`.*as a `Controller`"):
@@ -198,38 +178,27 @@ def test_a_supervised_control_is_drawn_to_the_lqr_by_the_norm_of_its_cost(trust:
 
 
 def test_supervised_linear_plant_is_stable_for_any_weights() -> None:
-    plant = systems.Linear([[0.0, 1.0], [2.0, -1.0]], [[0.0], [1.0]])
+    plant, x = systems.Linear([[0.0, 1.0], [2.0, -1.0]], [[0.0], [1.0]]), drawn(500, 3.0)
     lqr = adp.LQR(plant, COST)
     guard = adp.Supervised(learner(adp.Information()), lqr, COST, trust=0.5)
-    x = drawn(500, 3.0)
-    u = guard.restrain(
-        x, 100 * torch.randn(500, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
-    )
-    field = plant.drift(x) + (plant.effectiveness(x) @ u.unsqueeze(-1)).squeeze(-1)
-    fall = 2 * ((x @ lqr.p) * field).sum(-1)
+    u = guard.restrain(x, 300 * uniform(500, 1, seed=1))
+    fall = 2 * ((x @ lqr.p) * plant.motion(x, u)).sum(-1)
     assert (fall <= -COST.state_rate(x) + 1e-9).all()
 
 
 def test_supervisor_regulates_a_grid_of_initial_weights() -> None:
-    scales = torch.tensor([0.1, 0.2, 0.4, 0.7, 1.0, 1.5, 2.0], dtype=torch.float64).repeat_interleave(40)
-    critic = scales.unsqueeze(-1).expand(-1, 3)
+    critic = tensor([0.1, 0.4, 1.0, 2.0]).repeat_interleave(40).unsqueeze(-1).expand(-1, 3)
     points = adp.RandomPoints(1, BOX)
     inner = adp.ActorCritic(staf_basis(), TWO_STATE, COST, points, critic=critic, actor=0.7 * critic)
-    x0 = drawn(40, 2.0, seed=11).repeat(7, 1)
-    guarded = adp.Supervised(inner, LQR, COST)
+    x0, guarded = drawn(40, 2.0, seed=11).repeat(4, 1), adp.Supervised(inner, LQR, COST)
     run = adp.simulate(guarded, TWO_STATE, COST, x0, dt=0.01, steps=1000, every=1000, compile=True)
     regulated = ~run.diverged & (run.state[:, -1].norm(dim=-1) < 1e-3)
     assert float(regulated.double().mean()) >= 0.95
 
 
-def test_bounds_that_a_controller_was_made_with_are_those_of_its_loop(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("matplotlib.layout_engine.ConstrainedLayoutEngine.execute", lambda *_: None)
+def test_bounds_that_a_controller_was_made_with_are_those_of_its_loop() -> None:
     plant, cost = systems.Pendulum(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
-    x0 = torch.tensor([[0.3, 0.0]], dtype=torch.float64)
     policy = adp.LQR(plant, cost.bounded(-6.0, 8.0))
     for controller in (policy, adp.Supervised(adp.Feedback(policy), policy, cost)):
-        loop = adp.simulate(controller, plant, cost, x0, dt=0.05, steps=1)
+        loop = adp.simulate(controller, plant, cost, tensor([[0.3, 0.0]]), dt=0.05, steps=1)
         assert "bounds -6 to 8" in repr(loop)
-        assert "bounds" in loop.figure().axes[2].get_legend_handles_labels()[1]
