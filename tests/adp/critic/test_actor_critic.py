@@ -53,9 +53,7 @@ def test_weights_begin_as_numbers_lists_or_a_row_each() -> None:
     torch.testing.assert_close(begun.gain, torch.eye(3).double().expand(3, 3, 3) / 250)
     own = uniform(3, 3, seed=3)
     gains = tensor([1.0, 2.0, 4.0])
-    law = adp.Published()
-    given = learner(critic=[0.1, 0.2, 0.3], actor=own, gain=gains, law=law)
-    assert given.law is law
+    given = learner(critic=[0.1, 0.2, 0.3], actor=own, gain=gains, law=adp.Published())
     assert given.label == "actor-critic (Published)"
     begun = given.init(X)
     assert begun.critic.tolist() == [[0.1, 0.2, 0.3]] * 3
@@ -65,9 +63,6 @@ def test_weights_begin_as_numbers_lists_or_a_row_each() -> None:
     assert given.init(X).critic.tolist() == [[0.1, 0.2, 0.3]] * 3
     single = learner(critic=2, actor=torch.ones(3)).init(X.float())
     assert single.critic.dtype == single.actor.dtype == single.gain.dtype == torch.float32
-    assert single.critic.tolist() == [[2.0] * 3] * 3
-    assert isinstance(learner().law, adp.Information)
-    assert learner().draws == 2
 
 
 @pytest.mark.parametrize("centers", ["moving", "fixed"])
@@ -110,16 +105,8 @@ class Points(nn.Module):
 
     moving, draws, weights = True, 1, torch.ones(1, dtype=torch.float64)
 
-    def __init__(self, shape: Any) -> None:
-        super().__init__()
-        self.shape = shape
-
     def forward(self, x: Tensor, uniform: Tensor) -> Tensor:
-        assert x.dtype == uniform.dtype == torch.float64
-        assert (x.shape, uniform.shape) == ((1, 2), (1, 1, 2))
-        if self.shape is None:
-            raise RuntimeError("a bad size")
-        return torch.zeros(self.shape, dtype=torch.float64)
+        return torch.zeros((1, 4, 3), dtype=torch.float64)
 
 
 @pytest.mark.parametrize(
@@ -127,11 +114,15 @@ class Points(nn.Module):
     [
         ({"model": systems.RatePlant(lambda x, u: u - x, dim=2, inputs=2)}, "must be a ControlAffineSystem"),
         ({"model": systems.ThreeState()}, r"`ActorCritic\(basis=...\)` has 2 states, but the plant has 3"),
-        ({"extrapolation": Points((1, 4, 3))}, r"around states \(B, 2\); got \(1, 4, 3\)"),
-        ({"extrapolation": Points((1, 1, 4, 2))}, r"must make points .*; got \(1, 1, 4, 2\)"),
-        ({"extrapolation": Points(None)}, r"around states \(B, 2\) \(a bad size\); got Points"),
+        ({"extrapolation": Points()}, r"around states \(B, 2\); got \(1, 4, 3\)"),
         ({"cost": adp.QuadraticCost(1.0, 1.0, 2, 1, discount=0.1)}, r"must have no discount: .*; got 0.1"),
-        ({"critic": [0.1]}, r"`ActorCritic\(critic=...\)` must have 3 entries"),
+        (
+            {
+                "model": systems.Linear([[0.0, 1.0], [-1.0, 0.0]], [[0.0], [1.0]]),
+                "cost": adp.QuadraticCost(1.0, 1.0, 2, 1, target=[1.0, 0.0]),
+            },
+            "must have no target: the laws regulate to the origin",
+        ),
     ],
 )
 def test_parts_that_do_not_fit_are_refused(given: dict[str, Any], message: str) -> None:
@@ -139,76 +130,44 @@ def test_parts_that_do_not_fit_are_refused(given: dict[str, Any], message: str) 
         learner(**given)
 
 
-def test_a_set_point_is_refused() -> None:
-    plant = systems.Linear([[0.0, 1.0], [-1.0, 0.0]], [[0.0], [1.0]])
-    with pytest.raises(ValueError, match="must have no target: the laws regulate to the origin"):
-        learner(model=plant, cost=adp.QuadraticCost(1.0, 1.0, 2, 1, target=[1.0, 0.0]))
-
-
-@pytest.mark.parametrize("dt", [0.001, 0.005])
-def test_information_form_never_diverges_over_seeds(dt: float) -> None:
-    x0 = torch.tensor([-1.0, 1.0], dtype=torch.float64).repeat(100, 1)
-    duration = 10.0 if dt > 0.001 else 1.0  # whatever diverges does so in the first second
-    run = adp.simulate(
-        published(adp.Information()),
-        PLANT,
-        UNIT,
-        x0,
-        dt=dt,
-        steps=round(duration / dt),
-        every=200,
-        compile=True,
+def loop(control: adp.ActorCritic, x0: Tensor, dt: float, steps: int, **given: Any) -> adp.LoopResult:
+    """A run on a program, of which the first and the last states are recorded."""
+    return adp.simulate(
+        control, PLANT, control.cost, x0, dt=dt, steps=steps, every=steps, compile=True, **given
     )
-    assert not run.diverged.any()
-    assert (run.state[:, -1].norm(dim=-1) < (1e-3 if duration > 5 else 0.6)).all()
 
 
-def test_published_form_loses_some_seeds_that_the_information_form_keeps() -> None:
-    x0 = torch.tensor([-1.0, 1.0], dtype=torch.float64).repeat(200, 1)
-    run = adp.simulate(
-        published(adp.Published()),
-        PLANT,
-        UNIT,
-        x0,
-        dt=0.001,
-        steps=1000,
-        every=1000,
-        integrator="euler",
-        compile=True,
-    )
-    assert 0.15 <= float(run.diverged.double().mean()) <= 0.35  # MATH.md: 25 %
-    assert torch.isfinite(run.state).all()
-    assert torch.isfinite(run.critic_weights).all()
+START = tensor([-1.0, 1.0])
 
 
-def test_all_states_of_the_unit_box_are_regulated() -> None:
-    run = adp.simulate(
-        published(adp.Information()), PLANT, UNIT, drawn(200, 1.0, seed=5), dt=0.005, steps=2000, every=2000
-    )
+def test_the_information_form_regulates_the_unit_box_and_never_diverges_over_seeds() -> None:
+    x0 = torch.cat((START.repeat(100, 1), drawn(100, 1.0, seed=5)))
+    run = loop(published(adp.Information()), x0, 0.005, 2000)
     assert not run.diverged.any()
     assert (run.state[:, -1].norm(dim=-1) < 1e-3).all()
 
 
-def test_random_extrapolation_costs_what_the_reference_says() -> None:
-    x0 = torch.tensor([-1.0, 1.0], dtype=torch.float64).repeat(40, 1)
-    run = adp.simulate(
-        published(adp.Information()), PLANT, UNIT, x0, dt=0.001, steps=2500, every=2500, compile=True
-    )
+def test_random_extrapolation_costs_what_the_reference_says_and_no_seed_diverges() -> None:
+    run = loop(published(adp.Information()), START.repeat(40, 1), 0.001, 2500)
+    assert not run.diverged.any()
     assert 2.82 <= float(run.cost.median()) <= 2.85
     assert float(run.cost.min()) > 2.79
     assert float(run.cost.max()) < 2.87
 
 
+def test_published_form_loses_some_seeds_that_the_information_form_keeps() -> None:
+    run = loop(published(adp.Published()), START.repeat(200, 1), 0.001, 1000, integrator="euler")
+    assert 0.15 <= float(run.diverged.double().mean()) <= 0.35  # MATH.md: 25 %
+    assert torch.isfinite(run.state).all()
+    assert torch.isfinite(run.critic_weights).all()
+
+
 def test_global_basis_needs_points_in_a_fixed_box() -> None:
-    x0, start = drawn(40, 2.0, seed=8), [1.0, 0.0, 1.0]
-    settings = {"dt": 0.01, "steps": 1000, "every": 1000}
-    shares = []
+    x0, start, shares = drawn(40, 2.0, seed=8), [1.0, 0.0, 1.0], []
     for points in (adp.RandomPoints(1, 1.0, around="origin"), adp.RandomPoints(1, BOX)):
-        basis = adp.QuadraticBasis(2)
-        controller = adp.ActorCritic(basis, PLANT, UNIT, points, critic=start, actor=start)
-        run = adp.simulate(controller, PLANT, UNIT, x0, **settings, compile=True)
-        regulated = run.state[:, -1].norm(dim=-1) < 1e-3
-        shares.append(float(regulated.double().mean()))
+        control = adp.ActorCritic(adp.QuadraticBasis(2), PLANT, UNIT, points, critic=start, actor=start)
+        run = loop(control, x0, 0.01, 1000)
+        shares.append(float((run.state[:, -1].norm(dim=-1) < 1e-3).double().mean()))
         if len(shares) == 1:
             assert 1.0 < float((run.cost / PLANT.optimal_value(x0, UNIT.q, UNIT.r)).median()) < 1.05
     assert shares[0] == 1.0
@@ -236,15 +195,12 @@ def test_three_states_cost_in_their_first_second_what_the_reference_run_does() -
     assert float(run.cost.median()) == pytest.approx(3.13, abs=0.03)
 
 
-@pytest.mark.parametrize("kind", ["hard", "smooth"])
-def test_actor_critic_regulates_within_bounds(kind: str) -> None:
-    hard = adp.QuadraticCost(1.0, 1.0, 2, 1, low=-1.0, high=1.3)
-    smooth = adp.BoundedInputCost(1.0, 1.0, 2, 1, low=-1.0, high=1.3)
-    cost = {"hard": hard, "smooth": smooth}[kind]
+@pytest.mark.parametrize("kind", [adp.QuadraticCost, adp.BoundedInputCost])
+def test_actor_critic_regulates_within_bounds(kind: type[adp.QuadraticCost]) -> None:
+    cost = kind(1.0, 1.0, 2, 1, low=-1.0, high=1.3)
     control = adp.ActorCritic(staf_basis(), PLANT, cost, adp.RandomPoints(1, BOX))
-    run = adp.simulate(
-        control, PLANT, cost, drawn(6, 0.7, seed=3), dt=0.04, steps=150, every=50, compile=False
-    )
+    x0 = drawn(6, 0.7, seed=3)
+    run = adp.simulate(control, PLANT, cost, x0, dt=0.08, steps=75, every=25, compile=False)
     u = run.control[:, :-1]
     assert ((u >= -1.0) & (u <= 1.3)).all()
     assert (run.state[:, -1].norm(dim=-1) < 1e-2).all()
@@ -258,7 +214,7 @@ def test_every_state_of_the_box_is_regulated_near_the_optimum_in_its_first_episo
     law = adp.PolicyIteration()
     control = adp.ActorCritic(basis, PLANT, UNIT, points, law, critic=start, actor=start)
     x0 = drawn(60, 2.0, seed=11)
-    run = adp.simulate(control, PLANT, UNIT, x0, dt=0.02, steps=250, every=250, compile=True)
+    run = loop(control, x0, 0.02, 250)
     ratio = run.cost / (0.5 * x0[:, 0] ** 2 + x0[:, 1] ** 2)
     assert float(run.state[:, -1].norm(dim=-1).max()) < 0.05
     assert float(ratio.mean()) < 1.02

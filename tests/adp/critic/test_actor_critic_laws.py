@@ -122,25 +122,16 @@ def test_weights_are_projected_onto_a_ball_and_what_is_inside_is_left(kind: type
         assert all(torch.equal(a, b) for a, b in zip(free.init(*start), start, strict=True))
 
 
-def test_gains_begin_as_published_and_a_law_keeps_what_it_is_given() -> None:
+def test_gains_begin_as_published() -> None:
     start = uniform(2, 3, seed=1), uniform(2, 3, seed=2), 4 * torch.eye(3).double().expand(2, 3, 3)
     assert torch.equal(adp.Published().init(*start).gain, start[2])
     torch.testing.assert_close(adp.Information().init(*start).gain, start[2] / 16)
     assert torch.equal(adp.PolicyIteration().init(*start).gain, start[2])
-    for name in GAINS:
-        assert getattr(adp.Gains(**{name: 0.0}), name) == 0.0
-        for wrong in (-1e-9, rows(tensor([1.0, -1.0]))):
-            with pytest.raises(ValueError, match=rf"`Gains\({name}=...\)` must not be negative"):
-                adp.Gains(**{name: wrong})
-        with pytest.raises(ValueError, match=rf"`Gains\({name}=...\)` must be finite"):
-            adp.Gains(**{name: math.inf})
 
 
-@pytest.mark.parametrize("shape", [(3,), (3, 1), (1, 3, 1)])
-def test_gains_of_rows_have_one_number_a_row(shape: tuple[int, ...]) -> None:
+def test_gains_of_rows_have_one_number_a_row() -> None:
     with pytest.raises(ValueError, match=r"`Gains\(critic=...\)` must be a number, or `rows` of numbers"):
-        adp.Gains(critic=torch.ones(shape))
-    assert adp.Gains(critic=rows(torch.ones(3))).critic.shape == ()
+        adp.Gains(critic=torch.ones(3, 1))
 
 
 @pytest.mark.parametrize("size", [1, 5, 12, 13])
@@ -175,7 +166,7 @@ def continuous(law: ActorCriticLaw, duration: float) -> tuple[Tensor, Weights, T
     y = torch.cat([part.flatten(1) for part in (x, *controller.init(x)[:3], x.new_zeros(1, 1))], dim=-1)
     time = 0.0
     while time < duration - 1e-12:
-        h = min(0.1, 1e-3 + 0.02 * time, duration - time)
+        h = min(0.1, 1e-3 + 0.03 * time, duration - time)
         y, time = runge_kutta_step(field, y, h), time + h
     return parts(y)
 
@@ -196,7 +187,7 @@ def test_quadrature_reaches_the_reference_weights_and_cost() -> None:
 
 @torch.no_grad()
 def test_information_and_published_forms_are_one_law_in_continuous_time() -> None:
-    short = [continuous(law, 0.05) for law in LAWS]
+    short = [continuous(law, 0.02) for law in LAWS]
     torch.testing.assert_close(short[0][1].critic, short[1][1].critic, rtol=1e-3, atol=1e-4)
     torch.testing.assert_close(short[0][1].actor, short[1][1].actor, rtol=1e-3, atol=1e-4)
     product = short[0][1].gain @ short[1][1].gain
@@ -206,11 +197,8 @@ def test_information_and_published_forms_are_one_law_in_continuous_time() -> Non
 @pytest.mark.parametrize("law", [*LAWS, adp.PolicyIteration()], ids=lambda law: type(law).__name__)
 @torch.no_grad()
 def test_step_tends_to_the_rate(law: ActorCriticLaw) -> None:
-    generator = torch.Generator().manual_seed(3)
-    controller = learner(law, adp.QuadraturePoints(3, 2, BOX))
-    x = uniform(5, 2, seed=4)
-    memory = Weights(*controller.init(x)[:3])
-    memory = changed(memory, critic=torch.randn(5, 3, dtype=torch.float64, generator=generator))
+    controller, x = learner(law, adp.QuadraturePoints(3, 2, BOX)), uniform(5, 2, seed=4)
+    memory = changed(Weights(*controller.init(x)[:3]), critic=2 * uniform(5, 3, seed=3))
     terms = controller.terms(x, memory.actor, x.new_zeros(5, 0, 2))
     sums = law.sums(terms, controller.extrapolation.weights, memory)
     h = 1e-8
@@ -219,29 +207,16 @@ def test_step_tends_to_the_rate(law: ActorCriticLaw) -> None:
 
 
 def test_information_matrix_stays_positive_definite() -> None:
-    controller = learner(adp.Information())
-    x = uniform(20, 2, seed=0)
-    memory = controller.init(x)
-    generator = torch.Generator().manual_seed(1)
-    with torch.no_grad():
-        for _ in range(200):
-            draw = 2 * torch.rand(20, 1, 2, dtype=torch.float64, generator=generator) - 1
-            _, memory = controller.step(x, memory, draw, 0.05)
-            assert (torch.linalg.eigvalsh(memory.gain)[:, 0] > 0).all()
-
-
-def test_optimal_weights_of_the_quadratic_basis_stay_put_but_for_the_actor_decay() -> None:
-    gains = adp.Gains(actor_decay=0.0, critic=0.0, critic_extrapolated=0.25)
-    basis = adp.QuadraticBasis(2)
-    start = [0.5, 0.0, 1.0]
-    controller = adp.ActorCritic(
-        basis, PLANT, COST, adp.RandomPoints(1, BOX), adp.Information(gains), critic=start, actor=start
+    controller, x, uniforms = (
+        learner(adp.Information()),
+        uniform(20, 2, seed=0),
+        uniform(60, 20, 1, 2, seed=1),
     )
-    x = uniform(20, 2, seed=0)
     memory = controller.init(x)
-    terms = controller.terms(x, memory.actor, uniform(20, 2, seed=2).unsqueeze(1))
-    sums = controller.law.sums(terms, controller.extrapolation.weights, Weights(*memory[:3]))
-    assert sums.critic_force.abs().max() < 1e-13
+    with torch.no_grad():
+        for each in uniforms:
+            _, memory = controller.step(x, memory, each, 0.05)
+            assert (torch.linalg.eigvalsh(memory.gain)[:, 0] > 0).all()
 
 
 # --- policy iteration ---------------------------------------------------------------------------------------
