@@ -67,27 +67,8 @@ def cost_of(problem: adp.SampledProblem, x: Tensor, control: Tensor) -> Tensor:
 CART_REGION = [1.0, math.pi, 1.0, 2.0]
 
 
-class CartPole(systems.ControlAffineSystem):
-    """(place, angle from upright, and their rates); 1 kg, a pole of 0.1 kg and half a metre to its middle."""
-
-    dim, inputs, periodic = 4, 1, (1,)
-
-    def rate(self, x: Tensor, u: Tensor) -> Tensor:
-        _, angle, speed, turn = x.unbind(-1)
-        sine, cosine = angle.sin(), angle.cos()
-        pushed = (u[..., 0] + 0.05 * turn.square() * sine) / 1.1
-        bent = (9.8 * sine - cosine * pushed) / (0.5 * (4 / 3 - 0.1 * cosine.square() / 1.1))
-        return torch.stack((speed, turn, pushed - 0.05 * bent * cosine / 1.1, bent), dim=-1)
-
-    def drift(self, x: Tensor) -> Tensor:
-        return self.rate(x, torch.zeros_like(x[..., :1]))
-
-    def effectiveness(self, x: Tensor) -> Tensor:
-        return (self.rate(x, torch.ones_like(x[..., :1])) - self.drift(x)).unsqueeze(-1)
-
-
 def cart_pole(force: float = 10.0) -> adp.SampledProblem:
     """Its swing-up by a bounded force that is held for 20 ms."""
     weights = torch.diag(torch.tensor([1.0, 1.0, 0.1, 0.1], dtype=torch.float64))
     cost = adp.QuadraticCost(weights, 0.01, dim=4, inputs=1, low=-force, high=force)
-    return adp.SampledProblem.of(CartPole(), cost, dt=0.02)
+    return adp.SampledProblem.of(systems.CartPole(gravity=9.8), cost, dt=0.02)

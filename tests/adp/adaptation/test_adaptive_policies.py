@@ -29,9 +29,7 @@ def test_a_known_rate_of_the_seventh_degree_counts_exactly() -> None:
         a, b = x.unbind(-1)
         return torch.stack((a**7 - 2 * b**5 + a * b, 3 * a**3 * b**4 - b + u[..., 0]), dim=-1)
 
-    known = systems.RatePlant(rate, dim=2, inputs=1)
-    if not isinstance(known, systems.ControlAffineSystem):
-        known = adp.ParametricPlant(lambda x, u: 0 * x.unsqueeze(-1), rate, dim=2, inputs=1, theta=[0.0])
+    known = adp.ParametricPlant(lambda x, u: 0 * x.unsqueeze(-1), rate, dim=2, inputs=1, theta=[0.0])
     drift, x = drift_of(known=known), uniform(9, 2, seed=3)
     a, _ = drift.matrix(drift.init(x), x)
     torch.testing.assert_close(
@@ -39,71 +37,35 @@ def test_a_known_rate_of_the_seventh_degree_counts_exactly() -> None:
     )
 
 
-def test_a_drift_is_refused_what_it_cannot_be() -> None:
-    wrong: tuple[tuple[str, Any], ...] = (
-        ("known", systems.Pendulum),
-        ("kernel", torch.nn.Identity()),
-        ("offsets", [[0.1, 0.1]]),
-        ("offsets", CENTERS[0]),
-        ("offsets", CENTERS[:, :1]),
-        ("offsets", torch.zeros(3, 2).double()),
-        ("offsets", CENTERS * torch.nan),
-        ("forgetting", -0.1),
-        ("noise", -0.1),
-    )
-    for name, value in wrong:
-        with pytest.raises(ValueError, match=rf"{name}=..."):
-            drift_of(**{name: value})
-
-
 def plant_of(**given: Any) -> adp.ParametricPlant:
     usual = {"regressor": friction_and_inertia, "known": gravity, "dim": 2, "inputs": 1, "theta": [0.1, 1.0]}
     return adp.ParametricPlant(**(usual | given))  # type: ignore[arg-type]
 
 
-REFUSED: dict[str, tuple[dict[str, Any], str]] = {
-    "too many parameters": ({"theta": [0.1, 1.0, 2.0]}, r"regressor=...\)` must map \(4, 2\) to \(4, 2, 3\)"),
-    "rows twice": ({"rows": [1, 1]}, "rows"),
-    "rows in another order": ({"rows": [1, 0]}, "must be numbers of the 2 states, in order"),
-    "a row that is left out": ({"rows": [0]}, "must have all states whose regressor does not vanish"),
-    "no tensor": (
-        {"regressor": lambda x, u: 1.0},
-        r"regressor=...\)` must map \(4, 2\) to \(4, 2, 2\); got 1",
-    ),
-    "known of another shape": (
-        {"known": lambda x, u: x[..., :1]},
-        r"known=...\)` must map \(4, 2\) to \(4, 2\)",
-    ),
-    "a square of the input": (
-        {"known": lambda x, u: x + 0.01 * u.square()},
-        r"known=...\)` must be affine in u",
-    ),
-    "a sine of the input": (
-        {"regressor": lambda x, u: torch.stack((x, x * u.sin()), -1)},
-        r"regressor=...\)` must be affine in u",
-    ),
-}
-
-
-@pytest.mark.parametrize("case", REFUSED)
-def test_a_plant_that_is_none_is_refused(case: str) -> None:
-    given, message = REFUSED[case]
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"theta": [0.1, 1.0, 2.0]}, r"regressor=...\)` must map \(4, 2\) to \(4, 2, 3\)"),
+        ({"rows": [1, 0]}, "must be numbers of the 2 states, in order"),
+        ({"known": lambda x, u: x + 0.01 * u.square()}, r"known=...\)` must be affine in u"),
+        (
+            {"regressor": lambda x, u: torch.stack((x, x * u.sin()), -1)},
+            r"regressor=...\)` must be affine in u",
+        ),
+    ],
+)
+def test_a_plant_that_is_none_is_refused(given: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         plant_of(**given)
 
 
-def test_a_plant_may_have_one_state_no_inputs_large_rates_and_parameters_of_rows() -> None:
+def test_a_plant_may_have_no_inputs_and_parameters_of_rows() -> None:
     still = adp.ParametricPlant(lambda x, u: x.unsqueeze(-1), dim=1, inputs=0, theta=[2.0])
     assert still.effectiveness(torch.ones(3, 1).double()).shape == (3, 1, 0)
     assert still.drift(tensor([3.0])).tolist() == [6.0]
-    assert still.rows == [0]
-    plant_of(known=lambda x, u: 1e9 * (x + u))  # rounding is measured by its size
-    many = plant_of(theta=uniform(3, 2, seed=1))
-    assert many.parameters_count == 2
-    x, u = uniform(3, 2, seed=2), uniform(3, 1, seed=3)
+    many, x, u = plant_of(theta=uniform(3, 2, seed=1)), uniform(3, 2, seed=2), uniform(3, 1, seed=3)
     wanted = gravity(x, u) + (friction_and_inertia(x, u) @ many.theta.unsqueeze(-1)).squeeze(-1)
     torch.testing.assert_close(many.rate(x, u), wanted)
-    assert plant_of(theta=torch.tensor([1, 2])).theta.dtype == torch.float64
 
 
 def test_a_plant_of_effectiveness_or_behind_walls_is_that_plant() -> None:
@@ -121,9 +83,7 @@ def test_a_plant_of_effectiveness_or_behind_walls_is_that_plant() -> None:
     inside = plant_of(theta=[0.3, 2.0], rows=[1], bounds=systems.Bounds(-1.0, 1.0, 1))
     box = systems.Barrier(inside, [-1.0, -3.0], [1.5, 3.0])
     model = adp.ParametricPlant.of_barrier(box)
-    assert (model.dim, model.inputs, model.rows, model.periodic) == (2, 1, [1], box.periodic)
     assert model.bounds is inside.bounds
-    assert torch.equal(model.theta, inside.theta)
     torch.testing.assert_close(model.rate(x, u), box.rate(x, u))
 
 
@@ -147,11 +107,9 @@ def test_a_family_is_the_slopes_at_a_set_point() -> None:
         torch.testing.assert_close(a[k], torch.func.jacrev(mine.rate, argnums=0)(at, held))
         torch.testing.assert_close(b[k], torch.func.jacrev(mine.rate, argnums=1)(at, held))
     rule = "must vanish at the set-point, so that the plant rests there whatever theta is"
-    for x, u in ((tensor([0.1, 0.0]), held), (at, tensor([0.4])), (tensor([0.2, 0.1]), held)):
+    for x, u in ((tensor([0.1, 0.0]), held), (at, tensor([0.4]))):
         with pytest.raises(ValueError, match=rule):
             plant.family(x, u)
-    with pytest.raises(ValueError, match=rule):
-        plant.family()
 
 
 PLANT = systems.TwoState()
@@ -196,7 +154,7 @@ def test_weights_wait_in_doubt_and_every_state_is_regulated_near_the_optimum() -
     control = adaptive()
     # From the first three, weights that moved before the drift was known diverged.
     x0 = torch.cat((tensor([[0.858, 0.7204], [-1.8829, -1.4841], [-1.9202, -1.7179]]), uniform(5, 2) * 2))
-    run = loop(control, x0, 150)
+    run = loop(control, x0, 120)
     certain = run["certain"]
     assert torch.equal(certain[:, 0], torch.zeros(len(x0)).double())
     assert bool((certain[:, -1] == 1).all())
@@ -222,7 +180,7 @@ def test_where_the_model_is_certain_v_falls_for_every_theta_within_the_deviation
         return bool(control.certain(x, critic, uniforms, terms, estimate))
 
     low, high = 1e-8, 1e4
-    for _ in range(60):
+    for _ in range(40):
         middle = (low * high) ** 0.5
         low, high = (middle, high) if certain(middle) else (low, middle)
     slope, points = LEARNER.value_gradient(x, critic, uniforms), LEARNER.points(x, uniforms)
@@ -244,10 +202,10 @@ def test_a_model_that_is_known_makes_it_the_actor_critic() -> None:
 
 def test_rows_do_not_touch_and_what_was_learned_is_known_in_the_next_episode() -> None:
     control, x0 = adaptive(), uniform(6, 2)
-    whole, alone = loop(control, x0, 40), loop(control, x0[2:3], 40)
+    whole, alone = loop(control, x0, 20), loop(control, x0[2:3], 20)
     assert torch.equal(whole.state[2:3], alone.state)
     assert torch.equal(whole["theta"][2:3], alone["theta"])
-    learned = loop(control, tensor([[-1.5, 1.5]]), 80).carried.estimate
+    learned = loop(control, tensor([[-1.5, 1.5]]), 40).carried.estimate
     next_one = control.knowing(Estimate(*(part[0] for part in learned)))
     assert bool((loop(next_one, x0, 3)["certain"][:, 1] == 1).all())  # from the first step
     assert bool((loop(control, x0, 3)["certain"][:, 1] == 0).all())
@@ -268,7 +226,7 @@ def test_weights_begin_anew_where_the_plant_becomes_another_one() -> None:
     law = adp.LeastSquares([0.0], deviation=3.0, floor=1e-4, alarm=8.0)
     inside = adp.AdaptiveActorCritic(LEARNER, DAMPING, adp.IntegralWindows(DAMPING, 0.01), law)
     control = adp.Measured(inside, noise=0.0, dim=2)
-    run = adp.simulate(control, plant, plant.cost(COST), z0, dt=0.01, steps=80, compile=False)
+    run = adp.simulate(control, plant, plant.cost(COST), z0, dt=0.01, steps=60, compile=False)
     anew = int((run["resets"][0] > 0).to(torch.int8).argmax())
     assert 50 <= anew <= 53
     before, after = ((run.critic_weights[0, k] - tensor(FIRST)).abs().max() for k in (anew - 1, anew))

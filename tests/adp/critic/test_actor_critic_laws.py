@@ -129,11 +129,6 @@ def test_gains_begin_as_published() -> None:
     assert torch.equal(adp.PolicyIteration().init(*start).gain, start[2])
 
 
-def test_gains_of_rows_have_one_number_a_row() -> None:
-    with pytest.raises(ValueError, match=r"`Gains\(critic=...\)` must be a number, or `rows` of numbers"):
-        adp.Gains(critic=torch.ones(3, 1))
-
-
 @pytest.mark.parametrize("size", [1, 5, 12, 13])
 def test_definite_systems_are_solved_in_every_size(size: int) -> None:
     root = uniform(4, 2, size, size, seed=size)
@@ -192,18 +187,6 @@ def test_information_and_published_forms_are_one_law_in_continuous_time() -> Non
     torch.testing.assert_close(short[0][1].actor, short[1][1].actor, rtol=1e-3, atol=1e-4)
     product = short[0][1].gain @ short[1][1].gain
     torch.testing.assert_close(product, torch.eye(3, dtype=torch.float64).expand(1, 3, 3), rtol=0, atol=1e-3)
-
-
-@pytest.mark.parametrize("law", [*LAWS, adp.PolicyIteration()], ids=lambda law: type(law).__name__)
-@torch.no_grad()
-def test_step_tends_to_the_rate(law: ActorCriticLaw) -> None:
-    controller, x = learner(law, adp.QuadraturePoints(3, 2, BOX)), uniform(5, 2, seed=4)
-    memory = changed(Weights(*controller.init(x)[:3]), critic=2 * uniform(5, 3, seed=3))
-    terms = controller.terms(x, memory.actor, x.new_zeros(5, 0, 2))
-    sums = law.sums(terms, controller.extrapolation.weights, memory)
-    h = 1e-8
-    for after, before, rate in zip(law.step(sums, memory, h), memory, law.rates(sums, memory), strict=True):
-        torch.testing.assert_close((after - before) / h, rate, rtol=1e-4, atol=1e-3 * float(rate.abs().max()))
 
 
 def test_information_matrix_stays_positive_definite() -> None:

@@ -9,12 +9,11 @@ from typing import Any
 import pytest
 import torch
 from helpers import tensor, uniform
-from helpers_adp import COST, PLANT, staf_basis
+from helpers_adp import staf_basis
 from torch import Tensor
 
 import staf_torch as st
 from staf_torch import adp
-from staf_torch.adp.critic.bellman import bellman_error, bellman_terms
 from staf_torch.centers import Radius
 
 
@@ -94,14 +93,6 @@ def test_leading_coordinates_are_those_of_the_error() -> None:
     assert adp.LeadingCoordinates(staf_basis(), 4).follows_state
 
 
-def test_bellman_error_of_the_optimum_is_zero_in_the_quadratic_basis() -> None:
-    basis = adp.QuadraticBasis(2)
-    optimum = torch.tensor([0.5, 0.0, 1.0], dtype=torch.float64)  # x1^2 / 2 + x2^2
-    x = uniform(50, 2, low=-2, high=2, seed=0).unsqueeze(-2)
-    terms = bellman_terms(basis, PLANT, COST, x, x, optimum.expand(50, 3))
-    assert bellman_error(terms, optimum).abs().max() < 1e-12
-
-
 @pytest.mark.parametrize("basis", [adp.QuadraticBasis(2), adp.RBFGridBasis(2)], ids=["quadratic", "grid"])
 def test_a_global_basis_starts_near_the_square(basis: adp.ValueBasis) -> None:
     weights = torch.tensor(basis.weights_near_square(), dtype=torch.float64)
@@ -134,10 +125,3 @@ def test_points_are_the_cube_scaled_around_the_state_or_the_origin(around: str) 
             ValueError, match=r"\(half_width=...\)` must be constant for a box around the origin"
         ):
             adp.RandomPoints(4, st.StateRadius(0.5, 0.1), around="origin")
-
-
-def test_quadrature_takes_the_mean_over_the_box() -> None:
-    rule = adp.QuadraturePoints(7, 2, 0.5)
-    points = rule(torch.zeros(1, 2, dtype=torch.float64), torch.zeros(1, 0, 2))[0]
-    mean = (rule.weights * points[:, 0].pow(6) * points[:, 1].pow(4)).sum()
-    assert float(mean) == pytest.approx(0.5**10 / 35, rel=1e-12)

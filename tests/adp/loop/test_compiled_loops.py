@@ -6,7 +6,6 @@ import copy
 import dataclasses
 import logging
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -132,30 +131,6 @@ def test_a_row_has_the_same_bits_at_every_batch_and_beside_every_neighbour() -> 
     assert beside.diverged.tolist() == [False, True] * 100
 
 
-@pytest.mark.needs_compiler
-def test_loops_that_differ_in_gains_and_tensors_share_one_program(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class Own(systems.TwoState):
-        """A plant that no other test compiles."""
-
-        def drift(self, x: Tensor) -> Tensor:
-            return 1.01 * super().drift(x)
-
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    built, x0 = [], uniform(3, 1.0)
-    for gain in (0.7, 1.0, 2.0):  # 1 and powers of two, which a text may spell out
-        law = adp.Information(adp.Gains(critic=gain, critic_extrapolated=gain, forgetting=0.01 * gain))
-        basis = staf_basis()
-        basis.basis.centers.directions.mul_(gain)
-        case = adp.ActorCritic(basis, Own(), COST, adp.RandomPoints(1, BOX), law), Own(), COST
-        fast, plain = (run(case, x0, compile) for compile in (True, False))
-        torch.testing.assert_close(fast.actor_weights, plain.actor_weights, rtol=1e-9, atol=1e-12)
-        built.append(sorted(path.name for path in tmp_path.rglob("*.so")))
-    assert built[0]
-    assert built[1:] == built[:1] * 2
-
-
 class Branching(systems.TwoState):
     def drift(self, x: Tensor) -> Tensor:
         return super().drift(x) * (2.0 if bool(x.sum() > 1e9) else 1.0)
@@ -176,20 +151,12 @@ def test_what_cannot_be_compiled_runs_in_plain_torch_with_one_line(caplog: pytes
 
 @pytest.mark.needs_compiler
 def test_a_compiled_rollout_policy_is_its_definition_and_sees_what_changes() -> None:
-    policy = adp.RolloutPolicy.of_lqr(PLANT, COST, steps=4)
-    x = uniform(9, 0.5)
+    policy, x = adp.RolloutPolicy.of_lqr(PLANT, COST, steps=4), uniform(9, 0.5)
     assert lanes.ready(policy, x)
-    torch.testing.assert_close(policy(x), policy.control(x), rtol=CLOSE, atol=CLOSE)
-    for one in (x[:2], x[:1], x[3]):  # of one state a lane has a center, of several a state
-        for _ in range(2):
-            torch.testing.assert_close(policy(one), policy.control(one), rtol=CLOSE, atol=CLOSE)
-    for change in (lambda: setattr(policy, "horizon", 0.3), lambda: policy.base.k.mul_(1.1)):
+    for change in (lambda: None, lambda: setattr(policy, "horizon", 0.3), lambda: policy.base.k.mul_(1.1)):
         change()
-        torch.testing.assert_close(policy(x), policy.control(x), rtol=CLOSE, atol=CLOSE)
-    again = copy.deepcopy(policy)
-    torch.testing.assert_close(again(x), policy.control(x), rtol=CLOSE, atol=CLOSE)
-    at = x.clone().requires_grad_()
-    assert policy(at).requires_grad
+        for one in (x, x[:1], x[3]):  # of one state a lane has a center, of several a state
+            torch.testing.assert_close(policy(one), policy.control(one), rtol=CLOSE, atol=CLOSE)
 
 
 def test_a_loop_that_runs_again_sees_what_has_changed_since(caplog: pytest.LogCaptureFixture) -> None:

@@ -19,25 +19,7 @@ COST = adp.QuadraticCost(1.0, 0.1, dim=2, inputs=1)
 SCALAR_COST = adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1)
 
 
-@pytest.mark.parametrize("period", [0.01, 0.3, 2.0])
-def test_hold_of_the_double_integrator_is_its_polynomial(period: float) -> None:
-    t = period
-    f, g = torch.tensor([[0.0, 1.0], [0.0, 0.0]]).double(), torch.tensor([[0.0], [1.0]]).double()
-    hold = exact_hold(f, g, torch.eye(2).double(), torch.eye(1).double(), t)
-    a = torch.tensor([[1, t], [0, 1]], dtype=torch.float64)
-    b = torch.tensor([[t**2 / 2], [t]], dtype=torch.float64)
-    torch.testing.assert_close(hold.a, a, rtol=1e-13, atol=0)
-    torch.testing.assert_close(hold.b, b, rtol=1e-12, atol=0)
-    paid = [
-        [t, t**2 / 2, t**3 / 6],
-        [t**2 / 2, t + t**3 / 3, t**2 / 2 + t**4 / 8],
-        [t**3 / 6, t**2 / 2 + t**4 / 8, t + t**3 / 3 + t**5 / 20],
-    ]
-    torch.testing.assert_close(hold.paid, torch.tensor(paid, dtype=torch.float64), rtol=1e-10, atol=0)
-
-
-@pytest.mark.parametrize("discount", [0.0, 0.7])
-@pytest.mark.parametrize("period", [0.05, 1.5])
+@pytest.mark.parametrize(("discount", "period"), [(0.0, 0.05), (0.7, 1.5)])
 def test_what_a_held_input_costs_is_the_integral_along_its_way(discount: float, period: float) -> None:
     f, g = tensor([[0.1, 1.0], [-2.0, -0.3]]), tensor([[0.0], [1.0]])
     q, r = tensor([[2.0, 0.5], [0.5, 1.0]]), tensor([[0.3]])
@@ -50,12 +32,7 @@ def test_what_a_held_input_costs_is_the_integral_along_its_way(discount: float, 
     way = torch.linalg.matrix_exp(times[:, None, None] * whole) @ start.mT  # (T, 3, B)
     paid = (way[:, :2] * (q @ way[:, :2])).sum(1) + r[0, 0] * way[:, 2] ** 2
     paid = paid * (-discount * times).exp()[:, None]
-    weight = (
-        torch.tensor([1.0, *[4.0, 2.0] * (count // 2 - 1), 4.0, 1.0], dtype=torch.float64)
-        * period
-        / count
-        / 3
-    )
+    weight = tensor([1.0, *[4.0, 2.0] * (count // 2 - 1), 4.0, 1.0]) * period / count / 3
     torch.testing.assert_close((start * (start @ hold.paid)).sum(-1), weight @ paid, rtol=1e-9, atol=1e-12)
     ahead = start[:, :2] @ hold.a.mT + start[:, 2:] @ hold.b.mT
     torch.testing.assert_close(ahead, math.exp(-0.5 * discount * period) * way[-1, :2].mT)
@@ -93,20 +70,6 @@ def test_what_a_plant_in_steps_costs_is_the_sum_over_its_steps(discount: float) 
     torch.testing.assert_close(first @ hold.a.mT + u @ hold.b.mT, share * x)
 
 
-def test_value_of_the_held_lqr_is_the_cost_that_its_loop_pays() -> None:
-    lqr = adp.LQR(FALLING, COST, period=0.2)
-    x0 = torch.tensor([[0.3, -0.1]], dtype=torch.float64)
-    hold = exact_hold(*FALLING.linearisation(), COST.q, COST.r, 0.2)
-    x, paid = x0, 0.0
-    for _ in range(200):
-        z = torch.cat((x, lqr(x)), dim=-1)
-        paid += float(z @ hold.paid @ z.mT)
-        x = x @ hold.a.mT + lqr(x) @ hold.b.mT
-    assert float(lqr.value(x0)) == pytest.approx(paid, rel=1e-10)
-    continuous = adp.LQR(FALLING, COST)
-    assert float(lqr.value(x0)) > float(continuous.value(x0))
-
-
 def test_a_short_period_gives_the_gains_of_continuous_time() -> None:
     held, continuous = adp.LQR(FALLING, COST, period=1e-4), adp.LQR(FALLING, COST)
     torch.testing.assert_close(held.k, continuous.k, rtol=1e-3, atol=0)
@@ -142,6 +105,12 @@ def test_a_held_regulator_is_the_fixed_point_of_its_recursion(steps: bool, disco
     assert torch.equal(p, p.mT)
 
 
+def test_a_rotation_that_is_sampled_at_half_a_turn_cannot_be_regulated() -> None:
+    turning = systems.Linear([[0.0, 1.0], [-1.0, 0.0]], [[0.0], [1.0]])
+    with pytest.raises(ValueError, match=r"held for 3\.14159 s, is not stabilisable"):
+        adp.LQR(turning, COST, period=math.pi)
+
+
 @pytest.mark.parametrize("steps", [False, True])
 def test_a_mode_that_grows_slower_than_the_discount_need_not_be_stabilised(steps: bool) -> None:
     """exp(-rho t / 2) x decays: 0.2 1/s beside a half of the discount."""
@@ -156,12 +125,10 @@ def test_a_mode_that_grows_slower_than_the_discount_need_not_be_stabilised(steps
 
 def test_a_period_is_a_multiple_to_a_billionth() -> None:
     plant = in_steps(tensor([[1.0]]), tensor([[1.0]]), 0.5)
-    assert periods("call", plant, 1.5 * (1 + 0.9e-9)) == 3
-    assert periods("call", plant, 1.5 * (1 - 0.9e-9)) == 3
+    for dt in (1.5 * (1 + 0.9e-9), 1.5 * (1 - 0.9e-9)):
+        assert periods("call", plant, dt) == 3
     for dt in (1.5 * (1 + 1.2e-9), 1.5 * (1 - 1.2e-9), 0.2):
-        with pytest.raises(
-            ValueError, match=r"`call\(dt=...\)` must be a multiple of the plant's period of 0.5 s"
-        ):
+        with pytest.raises(ValueError, match=r"dt=...\)` must be a multiple of the plant's period of 0.5 s"):
             periods("call", plant, dt)
 
 
@@ -188,29 +155,25 @@ def test_loop_that_is_said_to_be_unstable_diverges_and_the_held_lqr_regulates_it
         lqr = adp.LQR(FALLING, COST, period=given)
         stability = adp.held_stability(lqr, FALLING, period)
         assert (stability.spectral_radius < 1) is stable
-        # Runge-Kutta on 10 steps a period, the control held by hand.
-        x = x0
-        for _ in range(30):
-            u = lqr(x)
-            hold = adp.Feedback(lambda _, u=u: u)
-            x = adp.simulate(hold, FALLING, COST, x, dt=period / 10, steps=10, every=10).state[:, -1]
-        assert (float(x.norm()) < 1e-2) is stable
+        run = adp.simulate(lqr, FALLING, COST, x0, dt=period, steps=30, every=30)
+        assert (float(run.state[:, -1].norm()) < 1e-2) is stable
 
 
 def test_others_that_move_by_themselves_do_not_make_a_loop_unstable() -> None:
     """A mass, and beside it a disc that moves at its own speed: only a mode that grows is told."""
-    for growth, stable in ((0.0, True), (0.5, False)):
+
+    def policy(x: Tensor) -> Tensor:
+        return -x[..., :1] - 2 * x[..., 1:2]
+
+    def beside(growth: float) -> systems.Linear:
         f = torch.zeros(4, 4).double()
-        f[0, 1] = f[2, 3] = 1.0
-        f[3, 3] = growth
-        both = systems.Linear(f.tolist(), [[0.0], [1.0], [0.0], [0.0]])
-        found = adp.held_stability(lambda x: -x[..., :1] - 2 * x[..., 1:2], both, 0.1)
-        assert (found.spectral_radius < 1) == stable
-        alone = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
-        mass = adp.held_stability(lambda x: -x[..., :1] - 2 * x[..., 1:2], alone, 0.1)
-        if stable:
-            assert found.spectral_radius == pytest.approx(mass.spectral_radius, abs=1e-9)
-            assert found.largest_period == pytest.approx(mass.largest_period, rel=1e-4)
+        f[0, 1], f[2, 3], f[3, 3] = 1.0, 1.0, growth
+        return systems.Linear(f.tolist(), [[0.0], [1.0], [0.0], [0.0]])
+
+    alone = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
+    found, mass = (adp.held_stability(policy, plant, 0.1) for plant in (beside(0.0), alone))
+    assert found == (pytest.approx(mass.spectral_radius), pytest.approx(mass.largest_period, rel=1e-4))
+    assert found.spectral_radius < 1 < adp.held_stability(policy, beside(0.5), 0.1).spectral_radius
 
 
 def test_a_clocked_loop_is_stable_around_the_state_that_is_told() -> None:
@@ -227,7 +190,7 @@ def test_a_clocked_loop_is_stable_around_the_state_that_is_told() -> None:
 def test_a_loop_in_steps_is_stable_up_to_a_number_of_its_periods() -> None:
     """Whatever the period is that it is asked for."""
     plant = in_steps(tensor([[1.0]]), tensor([[0.1]]))
-    for period in (0.1, 0.3, 0.6, 0.7, 2.0):
+    for period in (0.1, 0.3, 0.7):
         wanted = pytest.approx(abs(1 - 3 * period)), pytest.approx(0.6)
         assert adp.held_stability(lambda x: -3 * x, plant, period) == wanted
     assert adp.held_stability(lambda x: -2 / 99.95 * x, plant, 0.1).largest_period == pytest.approx(99.9)
@@ -236,30 +199,13 @@ def test_a_loop_in_steps_is_stable_up_to_a_number_of_its_periods() -> None:
     assert adp.held_stability(lambda x: 0 * x, plant, 0.1) == (1.0, None)
 
 
-def test_others_beside_a_loop_in_steps_count_only_where_they_grow() -> None:
-    for other, counted in ((1.0, False), (-1.0, False), (-1.2, True), (1.2, True)):
-        plant = in_steps(tensor([[1.0, 0.3], [0.0, other]]), tensor([[0.1], [0.0]]))
-        found = adp.held_stability(lambda x: -3 * x[..., :1], plant, 0.1).spectral_radius
-        assert found == pytest.approx(abs(other) if counted else 0.7)
-
-
-def test_a_period_of_a_billion_steps_is_answered_at_once() -> None:
-    plant = in_steps(tensor([[0.5, 0.1], [0.0, 0.4]]), tensor([[0.1], [0.2]]))
-    found = adp.held_stability(lambda x: 0.3 * x[..., :1], plant, 1e8)
-    rest = torch.linalg.solve(
-        torch.eye(2).double() - tensor([[0.5, 0.1], [0.0, 0.4]]), tensor([[0.1], [0.2]])
-    )
-    assert found.spectral_radius == pytest.approx(0.3 * float(rest[0]))
-
-
 def test_a_loop_that_overflows_within_a_period_is_unstable_and_told(caplog: pytest.LogCaptureFixture) -> None:
     plant, stepped = systems.Linear([[1000.0]], [[1.0]]), in_steps(tensor([[1.5e4]]), tensor([[1.0]]))
-    for period in (10.0, 1e5):
-        for each, gain in ((plant, -1001.0), (stepped, -1.5e4)):
-            assert adp.held_stability(lambda x, gain=gain: gain * x, each, period).spectral_radius > 1
-        assert adp.held_stability(lambda x: -1001 * x, plant, period).spectral_radius == INF
+    for each, gain in ((plant, -1001.0), (stepped, -1.5e4)):
+        assert adp.held_stability(lambda x, gain=gain: gain * x, each, 1.0).spectral_radius > 1
+    assert adp.held_stability(lambda x: -1001 * x, plant, 1.0).spectral_radius == INF
     cost = adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1)
-    adp.simulate(lambda x: -1001 * x, plant, cost, tensor([[1.0]]), dt=period, steps=1)
+    adp.simulate(lambda x: -1001 * x, plant, cost, tensor([[1.0]]), dt=1.0, steps=1)
     assert "has the spectral radius inf" in caplog.text
 
 
@@ -276,15 +222,3 @@ def test_a_loop_at_its_edge_and_one_without_a_slope_are_not_said_to_be_stable() 
     broken = adp.held_stability(lambda x: math.nan * x, line, 0.5)
     assert math.isnan(broken.spectral_radius)
     assert broken.largest_period is None
-    for period in (0.0, -0.5, math.inf):
-        with pytest.raises(ValueError, match=r"`held_stability\(period=...\)` must be (positive|finite)"):
-            adp.held_stability(lambda x: 0 * x, line, period)
-
-
-def test_bad_periods_are_refused_by_name() -> None:
-    with pytest.raises(ValueError, match=r"`exact_hold\(period=...\)` must be positive; got 0.0"):
-        adp.LQR(FALLING, COST, period=0.0)
-    # The rotation repeats itself after half a turn: sampled then, its input moves one line alone.
-    turning = systems.Linear([[0.0, 1.0], [-1.0, 0.0]], [[0.0], [1.0]])
-    with pytest.raises(ValueError, match=r"held for 3\.14159 s, is not stabilisable"):
-        adp.LQR(turning, COST, period=math.pi)

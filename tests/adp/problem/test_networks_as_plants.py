@@ -61,20 +61,14 @@ def test_every_planner_takes_networks_and_refuses_the_backward_pass_to_them(
     plant: systems.Plant, cost: adp.Cost
 ) -> None:
     problem = adp.SampledProblem.of(plant, cost, dt=0.05, terminal=0.0)
-    plan = adp.BoxDDP(problem, steps=4, iterations=4, compile=False).solve(X0)
+    plan = adp.BoxDDP(problem, steps=4, iterations=2, compile=False).solve(X0)
     refuses(plan.cost, "BoxDDP.solve")
     with torch.no_grad():
-        again = adp.BoxDDP(problem, steps=4, iterations=4, compile=False).solve(X0)
+        again = adp.BoxDDP(problem, steps=4, iterations=2, compile=False).solve(X0)
     assert torch.equal(again.cost, plan.cost)
     assert not again.cost.requires_grad
-    for planner in (
-        adp.RecedingHorizon(problem, steps=4, compile=False),
-        adp.PathIntegral(problem, steps=4, samples=10, knots=2, noise=0.5, compile=False),
-    ):
-        run = adp.simulate(planner, plant, cost, X0, dt=0.05, steps=2, compile=False)
-        assert torch.isfinite(run.cost).all()
-        if isinstance(planner, adp.RecedingHorizon):
-            refuses(run.cost, "RecedingHorizon.step")
+    planner = adp.RecedingHorizon(problem, steps=2, compile=False)
+    refuses(adp.simulate(planner, plant, cost, X0, dt=0.05, steps=1).cost, "RecedingHorizon.step")
     if plant.period is None:
         shot = adp.DirectShooting(plant, cost, horizon=0.2, intervals=4, terminal=0.0).solve(X0)
         torch.testing.assert_close(shot.value, plan.cost, rtol=0.05, atol=1e-4)
@@ -98,7 +92,6 @@ def test_policies_and_constraints_that_are_networks_run_and_are_filtered() -> No
     wall = network(2, 1)
     filtered = adp.SafetyFilter(policy, plant, lambda x, t: 2 + wall(x)[..., 0], dt=0.05, low=-5.0, high=5.0)
     assert torch.isfinite(filtered(X0)).all()
-    assert not adp.held_stability(policy, plant, 0.05).spectral_radius < 0
 
 
 def test_a_set_point_at_which_a_learnt_plant_does_not_rest_names_the_nearest_and_the_call() -> None:
@@ -122,18 +115,6 @@ def test_a_network_in_float32_says_what_it_says_first_and_what_to_do() -> None:
         systems.StepPlant(lambda x, u: x + 0.05 * net(torch.cat((x, u), -1)), dim=2, inputs=1, dt=0.05)
     with pytest.raises(ValueError, match=r"`Own.drift` must map .* in float32 needs `.double\(\)`"):
         adp.LQR(Own(torch.float32), COST)
-
-
-def test_a_network_without_derivatives_is_a_black_box_of_tensors() -> None:
-    net = network(3, 2)
-
-    def step(x: Tensor, u: Tensor) -> Tensor:
-        with torch.no_grad():
-            return x + 0.05 * net(torch.cat((x, u), -1))
-
-    plant = systems.StepPlant(step, dim=2, inputs=1, dt=0.05)
-    assert not plant.traceable
-    torch.testing.assert_close(adp.LQR(plant, COST).k, adp.LQR(STEP, COST).k, rtol=1e-4, atol=1e-4)
 
 
 def test_a_block_that_small_inputs_do_not_move_is_a_plant() -> None:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 import staf_torch as st
-from staf_torch import adp, optim, systems, targets
+from staf_torch import adp, systems
 
 PERIOD = 0.05
 
@@ -56,22 +56,13 @@ def test_black_box_is_regulated_like_the_same_plant_in_torch() -> None:
     torch.testing.assert_close(runs[0].state[:, -1], goal, rtol=0, atol=1e-6)
 
 
-def test_lqr_of_a_step_plant_is_that_of_the_held_plant_in_continuous_time() -> None:
-    linear = systems.Linear([[0.0, 1.0], [20.0, 0.0]], [[0.0], [1.0]])
-    hold = torch.linalg.matrix_exp(
-        0.1 * torch.tensor([[0.0, 1.0, 0.0], [20.0, 0.0, 1.0], [0.0, 0.0, 0.0]]).double()
-    )
-    plant = systems.StepPlant(
-        lambda x, u: x @ hold[:2, :2].numpy().T + u @ hold[:2, 2:].numpy().T, dim=2, inputs=1, dt=0.1
-    )
-    sampled = adp.LQR(plant, COST)
-    held = adp.held_stability(sampled, plant, 0.1).spectral_radius
-    assert held == pytest.approx(adp.held_stability(sampled, linear, 0.1).spectral_radius, rel=1e-6)
-    x0 = torch.tensor([[0.1, -0.2]], dtype=torch.float64)
-    run = adp.simulate(adp.Feedback(sampled), plant, COST, x0, steps=200)
-    assert float(run.cost) == pytest.approx(float(sampled.value(x0)), rel=1e-8)
-    slow = adp.LQR(plant, COST, period=0.3)
-    assert adp.held_stability(slow, plant, 0.3).spectral_radius < 1
+def test_lqr_of_a_step_plant_pays_its_value_and_holds_for_several_periods() -> None:
+    a, b = np.array([[1.0, 0.1], [2.0, 1.1]]), np.array([[0.005], [0.1]])
+    plant = systems.StepPlant(lambda x, u: x @ a.T + u @ b.T, dim=2, inputs=1, dt=0.1)
+    lqr, x0 = adp.LQR(plant, COST), torch.tensor([[0.1, -0.2]], dtype=torch.float64)
+    run = adp.simulate(lqr, plant, COST, x0, steps=100)
+    assert float(run.cost) == pytest.approx(float(lqr.value(x0)), rel=1e-8)
+    assert adp.held_stability(adp.LQR(plant, COST, period=0.3), plant, 0.3).spectral_radius < 1
     with pytest.raises(ValueError, match=r"must be a multiple of the plant's period of 0.1 s; got 0.25"):
         adp.LQR(plant, COST, period=0.25)
 
@@ -100,11 +91,11 @@ def test_costs_with_outputs_discount_and_blind_directions() -> None:
     blind = adp.QuadraticCost([[1.0, 0.0], [0.0, 0.0]], 1.0, dim=2, inputs=1)
     torch.testing.assert_close(adp.LQR(linear, seen).p, adp.LQR(linear, blind).p)
     for cost in (seen, adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, discount=0.7)):
-        for period in (None, 0.2):
-            lqr, dt = adp.LQR(linear, cost, period=period), period or 0.08
-            settings = {"dt": dt, "steps": round(8 / dt), "substeps": 4, "renew": period is None}
-            run = adp.simulate(adp.Feedback(lqr), linear, cost, x0, compile=False, **settings)
-            assert float(run.cost) == pytest.approx(float(lqr.value(x0)), rel=2e-4)
+        period = None if cost is seen else 0.2
+        lqr, dt = adp.LQR(linear, cost, period=period), period or 0.08
+        settings = {"dt": dt, "steps": round(8 / dt), "substeps": 4, "renew": period is None}
+        run = adp.simulate(adp.Feedback(lqr), linear, cost, x0, compile=False, **settings)
+        assert float(run.cost) == pytest.approx(float(lqr.value(x0)), rel=2e-4)
     unseen = adp.QuadraticCost([[0.0, 0.0], [0.0, 1.0]], 1.0, dim=2, inputs=1)
     with pytest.raises(ValueError, match=r"not detectable: the cost Q does not see its mode .* 0 1/s"):
         adp.LQR(linear, unseen)
@@ -130,13 +121,8 @@ def test_loop_that_is_held_too_long_is_said_to_be_unstable(caplog: pytest.LogCap
     ("function", "message"),
     [
         (lambda x, u: x, r"`StepPlant\(step=...\)` ignores u"),
-        (
-            lambda x, u: x[:, 0] + u[:, 0],
-            r"must map x and u of the shapes \(10, 2\) and \(10, 1\) to \(10, 2\)",
-        ),
         (lambda x, u: 1 / 0, r"`StepPlant\(step=...\)` raised ZeroDivisionError \(division by zero\)"),
         (lambda x, u: np.nan * (x + u), r"returned values that are not finite near x"),
-        (3.0, r"must be a function of x \(B, n\) and u \(B, m\); got 3.0"),
     ],
 )
 def test_bad_steps_are_refused_with_a_sentence(function: object, message: str) -> None:
@@ -160,17 +146,6 @@ def test_kinks_and_lost_modes_are_named() -> None:
         adp.LQR(lost, COST)
 
 
-def test_simulator_that_is_too_slow_for_its_period_is_said_to_be(caplog: pytest.LogCaptureFixture) -> None:
-    def slow(x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        time.sleep(0.002)
-        return turn(x, u)
-
-    with caplog.at_level(logging.WARNING):
-        adp.near_optimal(pendulum(slow, dt=0.01), COST, horizon=0.1, reach="local")
-    assert "of the 0.01 s for which it is held: it cannot run beside the plant" in caplog.text
-    assert "Shorten `horizon` (10 periods now)" in caplog.text
-
-
 @pytest.mark.parametrize(("seconds", "said"), [(0.04, False), (0.06, True)])
 def test_share_of_the_period_that_a_control_takes_is_said_from_a_half_on(
     seconds: float, said: bool, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
@@ -191,8 +166,6 @@ DOORS = {
     "near_optimal": lambda plant, cost: adp.near_optimal(plant, cost, dt=0.1),
     "DirectShooting": lambda plant, cost: adp.DirectShooting(plant, cost),
     "LQR": lambda plant, cost: adp.LQR(plant, cost),
-    "SampledProblem.of": lambda plant, cost: adp.SampledProblem.of(plant, cost, dt=0.1),
-    "hjb_residual": lambda plant, cost: adp.hjb_residual(plant, cost, lambda x: x[..., 0], START),
     "plan_around": lambda plant, cost: adp.plan_around(plant, cost, START, dt=0.1, steps=4),
     "DetourRollout": lambda plant, cost: adp.DetourRollout(
         adp.LQR(PENDULUM, COST), plant, cost, [], axes=[[1.0, 0.0]], dt=0.1, steps=4, terminal=torch.sum
@@ -203,29 +176,13 @@ DOORS = {
 @pytest.mark.parametrize("door", DOORS)
 def test_what_is_no_plant_and_what_is_no_cost_is_refused_with_what_to_write(door: str) -> None:
     made = rf"`{door}\((plant|system)=...\)` must be a Plant: `systems.RatePlant\(f"
-    for wrong in (lambda x, u: u, "pendulum", None, st.GaussianKernel, 3.0):
+    for wrong in (lambda x, u: u, st.GaussianKernel):
         with pytest.raises(ValueError, match=made):
             DOORS[door](wrong, COST)
         with pytest.raises(ValueError, match=rf"`{door}\(cost=...\)` must be a Cost: `QuadraticCost\("):
             DOORS[door](PENDULUM, wrong)
     with pytest.raises(ValueError, match=r"must be an object, and is the class: write `Pendulum\(...\)`"):
         DOORS[door](systems.Pendulum, COST)
-
-
-def test_a_plant_without_a_drift_and_a_basis_that_is_none_are_refused() -> None:
-    for wrong in (lambda x: -x, "pendulum", None, systems.Pendulum):
-        with pytest.raises(ValueError, match=r"`trajectory\(system=...\)` must be"):
-            systems.simulate(wrong, START, dt=0.1, steps=1)
-        with pytest.raises(ValueError, match=r"`chase\(basis=...\)` must be a StaFBasis: `StaFBasis\("):
-            st.chase(START[:, None], wrong, targets.Paper(), optim.Exact())
-    basis = st.StaFBasis(st.GaussianKernel(), st.StateFollowingCenters(st.rings(3), 0.1))
-    with pytest.raises(ValueError, match=r"`StaFBasis\(target=...\)` must be a function of points"):
-        basis.ideal_weights(START, "paper")
-    net = torch.nn.Linear(2, 1)
-    with pytest.raises(ValueError, match=r"must take points of torch.float64, .* write `net.double\(\)`"):
-        basis.ideal_weights(START, lambda y: net(y).squeeze(-1))
-    with pytest.raises(ValueError, match=r"`simulate\(controller=...\)` must take states of torch.float64"):
-        adp.simulate(net, PENDULUM, COST, START, dt=0.1, steps=1)
 
 
 def test_a_spread_is_one_number_or_one_a_coordinate() -> None:
@@ -236,11 +193,9 @@ def test_a_spread_is_one_number_or_one_a_coordinate() -> None:
 
     cost = adp.QuadraticCost([[1e6, 0.0], [0.0, 1.0]], 1.0, dim=2, inputs=1)
     near = functools.partial(adp.near_optimal, cost=cost, dt=0.05, reach="local", horizon=0.2)
-    for spread in ([2e-3, 5.0], torch.tensor([2e-3, 5.0], dtype=torch.float64), np.array([2e-3, 5.0])):
-        assert near(wheel(spread)).box.tolist() == [2e-3, 5.0]
-    assert near(wheel(0.5)).box.tolist() == [0.5, 0.5]
+    assert near(wheel(np.array([2e-3, 5.0]))).box.tolist() == [2e-3, 5.0]
     assert systems.Clocked(wheel((2e-3, 5.0))).spread == [2e-3, 5.0, 5.0]
-    for wrong in ([1.0, 2.0, 3.0], [1.0, -1.0], "wide", None, [1.0, math.nan]):
+    for wrong in ([1.0, 2.0, 3.0], [1.0, -1.0], "wide"):
         with pytest.raises(ValueError, match=r"`Linear\(spread=...\)` must be one positive number, or one"):
             near(wheel(wrong))
 
