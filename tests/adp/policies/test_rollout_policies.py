@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
-import pickle
 from typing import Any
 
 import pytest
@@ -17,7 +15,6 @@ from torch import Tensor
 import staf_torch as st
 from staf_torch import (
     ExponentialKernel,
-    GaussianKernel,
     Kernel,
     StaFBasis,
     StateFollowingCenters,
@@ -61,14 +58,6 @@ def test_rollout_of_the_optimal_policy_returns_the_optimal_value() -> None:
     torch.testing.assert_close(policy(x), best(x), rtol=0, atol=0.02)
 
 
-@torch.no_grad()
-def test_linear_plant_is_left_with_its_lqr() -> None:
-    plant = systems.Linear([[0.0, 1.0], [2.0, -1.0]], [[0.0], [1.0]])
-    policy = rollout(plant, radius=1e-3)
-    x = uniform(20, 2.0)
-    torch.testing.assert_close(policy(x), policy.base(x), rtol=1e-4, atol=1e-4)
-
-
 def test_a_rollout_costs_the_integral_along_its_way_and_the_end() -> None:
     """Of a linear plant under a linear policy, whose integral is known."""
     plant = systems.Linear([[0.0, 1.0], [-1.0, -0.5]], [[0.0], [1.0]])
@@ -94,16 +83,8 @@ def test_a_rollout_costs_the_integral_along_its_way_and_the_end() -> None:
 
 
 @torch.no_grad()
-def test_rollouts_of_one_state_cost_what_its_riccati_equation_says() -> None:
-    plant, cost = systems.Linear([[-0.5]], [[1.0]]), adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1)
-    value = math.sqrt(0.5**2 + 1) - 0.5  # P of 0 = -2 a P + 1 - P^2
-    policy, x = adp.RolloutPolicy.of_lqr(plant, cost, centers=3, steps=4), tensor([[0.8], [-0.3], [0.05]])
-    torch.testing.assert_close(policy.rollout(x), value * x.square().squeeze(-1), rtol=1e-4, atol=0)
-
-
-@torch.no_grad()
 def test_two_state_is_regulated_at_almost_the_optimal_cost() -> None:
-    x0 = uniform(200, 2.0, seed=1)
+    x0 = uniform(40, 2.0, seed=1)
     optimal = PLANT.optimal_value(x0, COST.q, COST.r)
     policy = rollout(horizon=0.5, steps=5)
     run = adp.simulate(adp.Feedback(policy), PLANT, COST, x0, dt=0.01, steps=400, every=400, compile=True)
@@ -135,38 +116,18 @@ def test_three_state_beats_the_lqr_and_the_published_cost() -> None:
 
 
 @torch.no_grad()
-def test_repetition_approaches_the_optimal_policy() -> None:
-    x = uniform(20, 1.5, seed=3)
-    best = COST.policy(
-        PLANT.effectiveness(x), value_gradient(lambda y: PLANT.optimal_value(y, COST.q, COST.r), x)
-    )
-    errors = [float((rollout(horizon=0.6, steps=6, depth=depth)(x) - best).abs().mean()) for depth in (1, 2)]
-    assert errors[1] < 0.5 * errors[0]
-
-
-@torch.no_grad()
 def test_improved_policy_under_hard_bounds_costs_less_than_the_clipped_lqr() -> None:
     plant = systems.Pendulum()
     cost = adp.QuadraticCost(1.0, 0.1, 2, 1, low=-6.0, high=9.0)
-    x0 = uniform(40, 0.5, seed=2)
+    x0 = uniform(16, 0.5, seed=2)
     paid = {}
     for policy in (adp.LQR(plant, cost), adp.RolloutPolicy.of_lqr(plant, cost)):
-        run = adp.simulate(adp.Feedback(policy), plant, cost, x0, dt=0.1, steps=40, every=40, compile=False)
+        run = adp.simulate(adp.Feedback(policy), plant, cost, x0, dt=0.1, steps=40, every=40, compile=True)
         assert (run.state[:, -1].norm(dim=-1) < 1e-2).all()
         paid[type(policy).__name__] = run.cost
     ratio = paid["RolloutPolicy"] / paid["LQR"]
     assert ratio.mean() < 1.0
     assert ratio.max() < 1.01
-
-
-@pytest.mark.parametrize("kernel", [ExponentialKernel(), GaussianKernel(1.0)], ids=lambda k: type(k).__name__)
-@torch.no_grad()
-def test_rows_and_leading_dimensions_are_alone(kernel: Kernel) -> None:
-    policy = rollout(kernel=kernel, steps=3)
-    x = uniform(6, 1.0).reshape(2, 3, 2)
-    whole = policy(x)
-    rows = torch.stack([policy(row) for row in x.reshape(6, 2)]).reshape(2, 3, 1)
-    torch.testing.assert_close(whole, rows, rtol=1e-10, atol=1e-11)
 
 
 def test_in_barrier_coordinates_rollouts_move_the_distances_to_the_walls() -> None:
@@ -206,29 +167,9 @@ def test_a_policy_that_is_improved_twice_rolls_the_first_improvement_out() -> No
 
 
 def test_a_copy_asks_for_itself() -> None:
-    policy = rollout(steps=2)
-    for other in (copy.deepcopy(policy), pickle.loads(pickle.dumps(rollout(steps=2)))):
-        torch.testing.assert_close(other(X), policy(X))
-        other.horizon = 0.1
-        torch.testing.assert_close(other(X), rollout(steps=2, horizon=0.1)(X))
-
-
-def test_the_usual_centers_are_as_many_as_quadratics_need_and_the_kernel_of_a_box_is_gaussian() -> None:
-    for dim, count in ((1, 3), (2, 6), (3, 10), (4, 9), (6, 13)):
-        plant = systems.Linear((-torch.eye(dim)).tolist(), torch.eye(dim)[:, :1].tolist())
-        policy = adp.RolloutPolicy.of_lqr(plant, adp.QuadraticCost(1.0, 1.0, dim=dim, inputs=1))
-        assert policy.basis.count == count
-        assert isinstance(policy.basis.kernel, ExponentialKernel)
-    box = systems.Barrier(PLANT, -3.0, 3.0)
-    assert isinstance(adp.RolloutPolicy.of_lqr(box, COST).basis.kernel, GaussianKernel)
-
-
-def test_rollouts_refuse_what_they_cannot_take() -> None:
-    steps = systems.StepPlant(lambda x, u: 0.9 * x + u, dim=2, inputs=1, dt=0.1)
-    with pytest.raises(ValueError, match=r"`RolloutPolicy\(model=...\)` must be a ControlAffineSystem"):
-        rollout(steps)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"\(basis=...\)` must have the plant's 2 states; got 3"):
-        rollout(directions=ball(10, 3))
+    other = copy.deepcopy(rollout(steps=2))
+    other.horizon = 0.1
+    torch.testing.assert_close(other(X), rollout(steps=2, horizon=0.1)(X))
 
 
 # --- energy -------------------------------------------------------------------------------------------------
@@ -257,7 +198,7 @@ def test_pendulum_swings_up_from_everywhere_within_its_bounds_where_the_lqr_does
     x0 = torch.tensor([[3.1, 0.0], [2.0, -1.0], [-1.0, 0.5], [0.0, 7.0]], dtype=torch.float64)
     policy = pump()
     ours, lqr = (
-        adp.simulate(adp.Feedback(one), TURNING, LIMITED, x0, dt=0.02, steps=steps, compile=False)
+        adp.simulate(adp.Feedback(one), TURNING, LIMITED, x0, dt=0.02, steps=steps, compile=True)
         for one, steps in ((policy, 260), (policy.lqr, 60))
     )
     assert (policy.lqr.cost.deviation(ours.state[:, -1]).norm(dim=-1) < 1e-3).all()
@@ -290,9 +231,8 @@ def test_bad_arguments_of_the_swing_up_are_refused_by_name() -> None:
     free = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
     with pytest.raises(ValueError, match=r"`EnergyShaping\(cost=...\)` or the plant must have bounds"):
         adp.EnergyShaping(TURNING, free, energy, gain=1.0, capture=1.0)
-    for wrong in ({"gain": 0.0}, {"capture": -1.0}):
-        with pytest.raises(ValueError, match=rf"`EnergyShaping\({next(iter(wrong))}=...\)` must be"):
-            pump(**wrong)
+    with pytest.raises(ValueError, match=r"`EnergyShaping\(gain=...\)` must be"):
+        pump(gain=0.0)
     step = systems.StepPlant(lambda x, u: x + 0.1 * u, dim=1, inputs=1, dt=0.1)
     with pytest.raises(ValueError, match=r"`EnergyShaping\(system=...\)` must be a ControlAffineSystem"):
         adp.EnergyShaping(step, LIMITED, energy, gain=1.0, capture=1.0)

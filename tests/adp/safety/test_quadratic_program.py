@@ -48,28 +48,7 @@ def test_as_many_cases_as_fit_are_compared_and_more_are_refused() -> None:
         cases(6, [0.0] * 4, [INF] * 4)
 
 
-@pytest.mark.parametrize("m", [1, 2, 3])
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_rows_of_any_dimensions_are_rows(m: int, dtype: torch.dtype) -> None:
-    wanted, normals, least, low, high = (part.to(dtype) for part in feasible(m, 2, rows=12))
-    least[5] = 5.0  # nothing fits
-    flat = found(wanted, normals, least, low, high)
-    assert flat.point.dtype == flat.shortfall.dtype == dtype
-    for shape in ((3, 2, 2), (12, 1), (1, 12), (2, 6)):
-        deep = found(
-            wanted.reshape(*shape, m), normals.reshape(*shape, 2, m), least.reshape(*shape, 2), low, high
-        )
-        assert deep.point.shape == (*shape, m)
-        assert deep.shortfall.shape == shape
-        torch.testing.assert_close(deep.point.reshape(12, m), flat.point, rtol=0, atol=1e-6)
-        torch.testing.assert_close(deep.shortfall.reshape(12), flat.shortfall, rtol=0, atol=1e-6)
-    for row in range(6):
-        alone = found(wanted[row], normals[row], least[row], low, high)
-        torch.testing.assert_close(alone.point, flat.point[row], rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize(("m", "k"), [(1, 1), (1, 3), (2, 1), (2, 2), (2, 3), (3, 2), (4, 1)])
-@pytest.mark.parametrize("size", [2.0**-12, 2.0**10, 2.0**20])
+@pytest.mark.parametrize(("m", "k", "size"), [(1, 3, 2.0**-12), (2, 2, 2.0**20), (3, 2, 2.0**10)])
 def test_the_unit_of_the_inputs_does_not_matter_nor_does_that_of_a_normal(
     m: int, k: int, size: float
 ) -> None:
@@ -98,7 +77,7 @@ def dense(wanted: np.ndarray, rows: np.ndarray, least: np.ndarray) -> np.ndarray
     return None if np.linalg.norm(left) < 1e-9 else wanted - left[:-1] / left[-1]
 
 
-@pytest.mark.parametrize(("m", "k"), [(1, 1), (1, 3), (2, 1), (2, 2), (2, 3), (3, 2), (4, 1)])
+@pytest.mark.parametrize(("m", "k"), [(2, 1), (2, 3), (3, 2), (4, 1)])
 def test_the_program_has_the_solution_of_a_dense_solver(m: int, k: int) -> None:
     generator = torch.Generator().manual_seed(10 * m + k)
     normals = torch.randn(60, k, m, dtype=torch.float64, generator=generator)
@@ -124,29 +103,20 @@ def test_the_program_has_the_solution_of_a_dense_solver(m: int, k: int) -> None:
 
 
 @pytest.mark.parametrize("m", [1, 2, 3])
-def test_no_row_knows_what_the_others_are(m: int) -> None:
+def test_no_row_knows_what_the_others_are_nor_how_rows_are_arranged(m: int) -> None:
     normals, wanted, least = uniform(8, 2, m, seed=1), 2 * uniform(8, m, seed=2), uniform(8, 2, seed=3)
     wanted[2], least[3], normals[4], least[5] = 1e12, 1e12, 1e-9 * normals[4], 5.0  # the last: none fits
     wanted[6], normals[7] = torch.nan, torch.nan
     low, high = torch.full((m,), -0.7, dtype=torch.float64), torch.full((m,), 0.9, dtype=torch.float64)
     together = found(wanted, normals, least, low, high)
     assert bool(together.point[6:].isnan().all())
+    deep = found(wanted.view(2, 4, m), normals.view(2, 4, 2, m), least.view(2, 4, 2), low, high)
+    torch.testing.assert_close(deep.point.view(8, m), together.point, equal_nan=True)
+    assert deep.shortfall.shape == (2, 4)
     for k in range(6):
         alone = found(wanted[k : k + 1], normals[k : k + 1], least[k : k + 1], low, high)
         torch.testing.assert_close(alone.point, together.point[k : k + 1], rtol=1e-12, atol=1e-12)
         torch.testing.assert_close(alone.shortfall, together.shortfall[k : k + 1], rtol=1e-9, atol=1e-12)
-
-
-@pytest.mark.parametrize("m", [1, 2, 3, 5])
-def test_of_one_inequality_without_bounds_the_foot_is_the_answer(m: int) -> None:
-    normals, wanted, above = uniform(30, 1, m, seed=1), uniform(30, m, seed=2), uniform(30, seed=3)
-    square = normals[:, 0].square().sum(-1)
-    level = (normals[:, 0] * wanted).sum(-1)
-    answer = found(wanted, normals, (level + above).unsqueeze(-1))
-    foot = wanted + (above.clamp(min=0) / square).unsqueeze(-1) * normals[:, 0]
-    torch.testing.assert_close(answer.point, foot, rtol=1e-10, atol=1e-11)
-    assert torch.equal(answer.point[above < 0], wanted[above < 0])
-    assert float(answer.shortfall.max()) < 1e-11
 
 
 @pytest.mark.parametrize("m", [1, 2, 3])
@@ -161,42 +131,31 @@ def test_a_zero_normal_is_what_nothing_can_change(m: int) -> None:
     torch.testing.assert_close(answer.point, expected, rtol=0, atol=1e-7)
 
 
-def test_of_one_unknown_the_answer_is_an_interval() -> None:
-    normals, least = uniform(300, 3, 1, seed=4), 0.6 * uniform(300, 3, seed=5)
-    normals[0, 1] = 0.0
-    wanted, low, high = uniform(300, 1, seed=6), tensor([-0.7]), tensor([0.9])
-    answer = found(wanted, normals, least, low, high)
-    empty = 0
-    for row in range(300):
-        ends = [(a, c / a) for (a,), c in zip(normals[row].tolist(), least[row].tolist(), strict=True) if a]
-        bottom = max([end for a, end in ends if a > 0], default=-INF)
-        top = min([end for a, end in ends if a < 0], default=INF)
-        point = (bottom + top) / 2 if bottom > top else min(max(float(wanted[row]), bottom), top)
-        empty += bottom > top
-        assert float(answer.point[row]) == pytest.approx(min(max(point, -0.7), 0.9), abs=1e-14)
-    assert 30 < empty < 200
-
-
-@pytest.mark.parametrize("angle", [0.1, 1e-3, 1e-5])
-def test_edges_that_are_nearly_parallel_meet_where_they_do(angle: float) -> None:
-    turned = [0.3, 0.3 + math.pi - angle]  # a wedge: its tip is nearest to what lies behind it
+@pytest.mark.parametrize(("half", "far", "wanted"), [(0.05, 1.0, -2.0), (5e-6, 1.0, -2.0), (0.02, 1e6, -1e6)])
+def test_the_tip_of_a_wedge_is_found_however_narrow_and_however_far(
+    half: float, far: float, wanted: float
+) -> None:
+    """Two edges at an angle of twice `half` that open along 0.3, and a point behind their tip."""
+    turned = [0.3 + math.pi / 2 - half, 0.3 - math.pi / 2 + half]
     normals = tensor([[[math.cos(each), math.sin(each)] for each in turned]])
-    tip = tensor([[0.7, -1.3]])
-    least = (normals * tip.unsqueeze(-2)).sum(-1)
-    away = -normals[0].sum(0)
-    answer = found(tip + 2 * away / away.norm(), normals, least)
-    torch.testing.assert_close(answer.point, tip, rtol=0, atol=1e-9 / angle)
+    along = tensor([[math.cos(0.3), math.sin(0.3)]])
+    tip = far * along
+    answer = found(tip + wanted * along, normals, (normals * tip.unsqueeze(-2)).sum(-1))
+    torch.testing.assert_close(answer.point, tip, rtol=1e-11, atol=5e-10 / half)
     assert float(answer.shortfall) < 1e-9
 
 
-@pytest.mark.parametrize("far", [10.0, 1e4, 1e6])
-def test_a_corner_far_from_what_is_wanted_is_found(far: float) -> None:
-    """A wedge that opens away from the origin, where the control is wanted: its edges all but pass by it."""
-    turned = [0.3 + math.pi / 2 - 0.02, 0.3 - math.pi / 2 + 0.02]
-    normals = tensor([[[math.cos(each), math.sin(each)] for each in turned]])
-    tip = far * tensor([[math.cos(0.3), math.sin(0.3)]])
-    answer = found(torch.zeros(1, 2).double(), normals, (normals * tip.unsqueeze(-2)).sum(-1))
-    torch.testing.assert_close(answer.point, tip, rtol=1e-11, atol=0)
+def test_of_one_unknown_the_answer_is_an_interval_or_the_middle_of_what_is_missing() -> None:
+    normals, least = uniform(100, 3, 1, seed=4), 0.6 * uniform(100, 3, seed=5)
+    wanted, low, high = uniform(100, 1, seed=6), tensor([-0.7]), tensor([0.9])
+    answer = found(wanted, normals, least, low, high)
+    ends, up = least / normals[..., 0], normals[..., 0] > 0
+    bottom = torch.where(up, ends, -INF).amax(-1)
+    top = torch.where(up, INF, ends).amin(-1)
+    empty = bottom > top
+    point = torch.where(empty, (bottom + top) / 2, torch.minimum(torch.maximum(wanted[:, 0], bottom), top))
+    torch.testing.assert_close(answer.point[:, 0], point.clamp(-0.7, 0.9), rtol=0, atol=1e-13)
+    assert 10 < int(empty.sum()) < 70
 
 
 @pytest.mark.parametrize("m", [2, 3])
@@ -218,7 +177,7 @@ def test_where_nothing_fits_no_small_step_within_the_bounds_misses_less(m: int) 
         assert bool((missing(other) >= missing(answer.point) - 1e-8)[none].all())
 
 
-@pytest.mark.parametrize(("m", "k"), [(1, 2), (2, 2), (3, 2), (3, 3), (4, 2)])
+@pytest.mark.parametrize(("m", "k"), [(1, 2), (2, 2), (3, 3)])
 def test_single_precision_has_the_same_answers_also_where_nothing_fits(m: int, k: int) -> None:
     wanted, normals, least, low, high = feasible(m, k, rows=100)
     for far in (least, least + normals.norm(dim=-1)):

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import copy
 import math
-import pickle
 from typing import Any
 
 import numpy as np
@@ -14,7 +12,6 @@ from helpers import tensor, uniform
 from torch import Tensor
 
 from staf_torch import adp, systems
-from staf_torch.adp.safety.box_filter import walls
 
 LINE = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
 PLANE = systems.Linear(
@@ -38,9 +35,7 @@ def passing(x: Tensor, t: Tensor) -> Tensor:
 
 
 def test_far_from_the_edge_not_a_bit_changes_and_rows_are_alone() -> None:
-    guard = adp.SafetyFilter(
-        lambda x: -x[..., 2:], PLANE, [disc, passing], dt=0.02, low=[-1.0, -2.0], high=1.5
-    )
+    guard = adp.SafetyFilter(lambda x: -x[..., 2:], PLANE, [disc, passing], dt=0.02)
     x, u = uniform(24, 4, seed=1, low=-2.0, high=2.0), uniform(24, 2, seed=2, low=-0.9, high=0.9)
     t = uniform(24, low=0.0, high=2.0, seed=3)
     found = guard.restrain(x, u, t)
@@ -51,62 +46,6 @@ def test_far_from_the_edge_not_a_bit_changes_and_rows_are_alone() -> None:
     alone = guard.restrain(x[23:], u[23:], t[23:])
     assert all(torch.equal(a[0], b[23]) for a, b in zip(alone, found, strict=True))
     assert torch.equal(found.margin, guard.margins(x, t))
-
-
-@pytest.mark.parametrize(("low", "high"), [(2.0, 5.0), (-1.0, 1.0), (2.0, math.inf), (-math.inf, -2.0)])
-def test_a_wall_of_a_box_is_crossed_at_the_rate_of_the_coordinate(low: float, high: float) -> None:
-    (h,) = walls([-math.inf, low], [math.inf, high])
-    for wall, inward in ((low, 1.0), (high, -1.0)):
-        if math.isfinite(wall):
-            at = torch.tensor([[9.0, wall]], dtype=torch.float64, requires_grad=True)
-            value = h(at, 0.0)
-            (slope,) = torch.autograd.grad(value.sum(), at)
-            assert value.item() == pytest.approx(0.0, abs=1e-15)
-            assert slope[0].tolist() == pytest.approx([0.0, inward])
-
-
-def test_a_wall_is_never_crossed_and_a_larger_margin_keeps_farther_away() -> None:
-    x0 = torch.stack((uniform(8, low=0.2, high=2.0, seed=4), uniform(8, low=-0.2, high=1.0, seed=5)), dim=-1)
-    least = []
-    for margin in (0.0, 0.05):
-        guard = adp.SafetyFilter(lambda x: 0 * x[..., :1] - 3, LINE, wall, dt=0.2, decay=4.0, margin=margin)
-        run = adp.simulate(guard, LINE, COST, x0, steps=5, compile=False)
-        report = guard.report(run)
-        assert report["constraint_violations"] == 0
-        assert report["infeasible"] == []
-        assert report["minimum_margin"] >= margin
-        assert report["minimum_margin"] == pytest.approx(
-            float(guard.margins(run.state, 0.0).min()), abs=1e-12
-        )
-        least.append(guard.margins(run.state[:, -1], 0.0)[:, 0])
-    assert bool((least[0] < least[1]).all())
-
-
-def test_discs_that_move_and_appear_are_avoided_within_the_bounds() -> None:
-    lqr = adp.LQR(PLANE, COST4)
-    guard = adp.SafetyFilter(lqr, PLANE, [disc, passing], dt=0.1, low=-1.0, high=1.0)
-    assert guard.degree == (2, 2)
-    assert guard.moving
-    x0 = tensor([[2.0, 0.5, 0.0, 0.0], [1.5, -0.9, 0.0, 0.0]])
-    run = adp.simulate(guard, PLANE, COST4, x0, steps=12, every=4, compile=False)
-    report = guard.report(run)
-    assert report["minimum_margin"] > 0
-    assert 0 < report["acted"] < 1
-    assert float(run.control[:, :-1].abs().max()) <= 1
-    bare = adp.simulate(adp.Feedback(lqr), PLANE, COST4, x0, dt=0.1, steps=12, every=4, compile=False)
-    assert float(guard.margins(bare.state, bare.time).min()) < 0
-    assert "filtered" in guard.label
-
-
-def test_rows_that_cannot_be_kept_are_named() -> None:
-    guard = adp.SafetyFilter(lambda x: -x[..., 1:], LINE, wall, dt=0.05, low=-1.0, high=1.0)
-    x0 = tensor([[1.0, 0.0], [0.0, -2.0], [2.0, 0.0]])
-    run = adp.simulate(guard, LINE, COST, x0, steps=2, compile=False)
-    report = guard.report(run)
-    assert report["infeasible"] == [1]
-    assert report["constraint_violations"] == 1
-    assert report["minimum_margin"] < 0 < report["largest_slack"]
-    assert float(run.control[1, 0]) == 1.0  # as much as there is
 
 
 def test_policies_of_all_kinds_stand_behind_it() -> None:
@@ -129,27 +68,6 @@ def test_policies_of_all_kinds_stand_behind_it() -> None:
         adp.simulate(guard, LINE, COST, x0, dt=0.1, steps=1)
 
 
-def test_weights_say_which_input_shall_move() -> None:
-    def both(x: Tensor, t: Tensor) -> Tensor:
-        return 1 - x[:, 2] - x[:, 3]
-
-    x, want = tensor([0.0, 0.0, 0.5, 0.5]), tensor([1.0, 1.0])
-    even = adp.SafetyFilter(lambda x: x, PLANE, both, dt=0.01).restrain(x, want).control
-    dear = adp.SafetyFilter(lambda x: x, PLANE, both, dt=0.01, weight=[1e6, 1.0]).restrain(x, want).control
-    torch.testing.assert_close(even, tensor([0.0, 0.0]), rtol=0, atol=1e-9)
-    torch.testing.assert_close(dear, tensor([1.0, -1.0]), rtol=0, atol=1e-5)
-
-
-def test_a_copy_a_pickle_and_single_precision_are_the_same_filter() -> None:
-    guard = adp.SafetyFilter(adp.LQR(LINE, COST), LINE, wall, dt=0.05)
-    x = tensor([[0.3, -0.5], [1.0, 0.0]])
-    for other in (copy.deepcopy(guard), pickle.loads(pickle.dumps(guard))):
-        assert torch.equal(other(x), guard(x))
-    single = guard(x.float())
-    assert single.dtype == torch.float32
-    torch.testing.assert_close(single.double(), guard(x), rtol=1e-4, atol=1e-4)
-
-
 @pytest.mark.parametrize(
     ("given", "message"),
     [
@@ -162,74 +80,17 @@ def test_a_copy_a_pickle_and_single_precision_are_the_same_filter() -> None:
             {"constraints": lambda x, t: x},
             r"number 0 `h\(x, t\)` must map rows \(7, 2\) to \(7,\), .*; got \(7, 2\)",
         ),
-        (
-            {"constraints": lambda x, t: 1 + 0 * x[:, 0]},
-            "moves neither first nor second derivative of number 0",
-        ),
-        (
-            {"decay": [200.0], "degree": 2},
-            r"must be at most 1/dt = 100 where the relative degree is two; got",
-        ),
+        ({"constraints": lambda x, t: 1 + 0 * x[:, 0]}, "neither first nor second derivative of number 0"),
+        ({"decay": [200.0]}, r"must be at most 1/dt = 100 where the relative degree is two; got"),
         ({"decay": [1.0, 2.0]}, "must be one number or a list of 1"),
         ({"weight": [1.0, 1.0]}, "must be one number or a list of 1"),
-        ({"degree": 3}, "must be 1 or 2, one a constraint"),
+        ({"degree": [1, 3]}, r"`SafetyFilter\(degree=...\)` must be 1 or 2, one a constraint"),
     ],
 )
 def test_what_breaks_a_rule_is_refused(given: dict[str, object], message: str) -> None:
     usual: dict[str, object] = {"policy": lambda x: x, "plant": LINE, "constraints": wall, "dt": 0.01}
     with pytest.raises(ValueError, match=message):
         adp.SafetyFilter(**{**usual, **given})  # type: ignore[arg-type]
-
-
-class Turning(systems.ControlAffineSystem):
-    """(p, angle)' = (v cos, v sin, w): what v moves changes within a hold as w turns it."""
-
-    dim, inputs = 3, 2
-
-    def drift(self, x: Tensor) -> Tensor:
-        return torch.zeros_like(x)
-
-    def effectiveness(self, x: Tensor) -> Tensor:
-        none, one = torch.zeros_like(x[..., 0]), torch.ones_like(x[..., 0])
-        rows = (x[..., 2].cos(), none), (x[..., 2].sin(), none), (none, one)
-        return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
-
-
-@pytest.mark.parametrize("decay", [9.0, 60.0])
-def test_a_condition_that_bends_is_met_or_the_slack_says_so(decay: float) -> None:
-    """A unicycle turns by half a radian within a hold: no line is like its condition."""
-    shield = adp.SafetyFilter(
-        lambda x: x[..., :2], Turning(), disc, dt=0.1, low=[-1, -5], high=[1, 5], decay=decay, degree=1
-    )
-    x, angle = uniform(1000, 3, low=-1.0, high=1.0, seed=7), uniform(1000, low=0.0, high=6.28, seed=8)
-    x[:, 0], x[:, 1] = (
-        1 + (0.5 + 0.1 * x[:, 0].abs()) * angle.cos(),
-        (0.5 + 0.1 * x[:, 1].abs()) * angle.sin(),
-    )
-    x = torch.cat((x[:, :2], 3.14 * x[:, 2:]), dim=-1)
-    x = x[disc(x, tensor(0.0)) >= 0]
-    wanted = uniform(len(x), 2, low=-1.0, high=1.0, seed=9) * tensor([1.0, 5.0])
-    found = shield.restrain(x, wanted)
-
-    def after(u: Tensor) -> tuple[Tensor, Tensor]:
-        halves = [x]
-        for _ in range(2):
-            halves.append(
-                systems.runge_kutta_step(lambda z: shield.plant.motion(z, u), halves[-1], 0.5 * shield.hold)
-            )
-        now, middle, end = (disc(each, tensor(0.0)) for each in halves)
-        dip = (0.5 * (now + end) - middle).clamp(min=0)
-        return end, dip + math.exp(-decay * shield.hold) * (now - dip)
-
-    end, required = after(wanted)
-    asked = (required - end).clamp(min=0)
-    end, required = after(found.control)
-    missing = (required - end).clamp(min=0)
-    assert int((asked > 0).sum()) > 60
-    met = found.slack < 1e-9
-    assert bool((missing[met] <= 2e-6 * asked[met] + 1e-12).all())
-    assert bool((missing[~met] > 0).all())
-    assert float(met.double().mean()) > 0.9
 
 
 def test_a_condition_that_no_control_moves_leaves_a_finite_slack_and_the_others_kept() -> None:
@@ -331,18 +192,6 @@ def test_the_control_is_the_nearest_that_meets_the_condition_written_out(
     outside = found.margin[:, 0] < 0
     assert float(found.slack[~outside].max()) < 1e-6
     assert bool((found.slack[outside] > 1e-6).all())
-    # The line at a control has the slope of phi at the end, and its value.
-    normal, least, h_now = guard.inequalities(x, wanted, t)
-    assert torch.equal(h_now[:, 0], found.margin[:, 0])
-    held = level(x=x, t=t, **given) >= 0
-    x, wanted, t, normal, least, asked = (each[held] for each in (x, wanted, t, normal, least, asked))
-    ends = []
-    for other in (wanted - 1e-4, wanted + 1e-4):
-        end = advanced(advanced(x, other, hold / 2), other, hold / 2)
-        ends.append(level(h, degree, decay, margin, end, t + hold))
-    torch.testing.assert_close(normal[:, 0, 0] * hold, (ends[1] - ends[0]) / 2e-4, rtol=1e-5, atol=1e-6)
-    off = least[:, 0] - normal[:, 0, 0] * wanted[:, 0]
-    torch.testing.assert_close(off, asked / hold, rtol=1e-9, atol=1e-9)
 
 
 def test_the_slack_is_how_much_further_a_control_would_have_to_reach() -> None:
@@ -369,22 +218,17 @@ def test_rows_of_any_dimensions_are_rows_with_a_time_of_their_own() -> None:
     flat, margins = guard.restrain(x, 3 + x[:, :1], t), guard.margins(x, t)
     assert flat.control.shape == (12, 1)
     torch.testing.assert_close(margins, torch.stack((near(x, t), slow(x, t)), dim=-1))
-    for shape in ((3, 2, 2),):
-        deep, at = x.reshape(*shape, 2), t.reshape(shape)
-        found = guard.restrain(deep, 3 + deep[..., :1], at)
-        assert found.control.shape == (*shape, 1)
-        assert found.margin.shape == (*shape, 2)
-        assert found.slack.shape == shape
-        for one, other in zip(found, flat, strict=True):
-            torch.testing.assert_close(one.reshape(other.shape), other, rtol=1e-12, atol=1e-12)
-        torch.testing.assert_close(guard.margins(deep, at).reshape(12, 2), margins)
-        torch.testing.assert_close(guard(deep, at), found.control)
+    deep, at = x.reshape(3, 2, 2, 2), t.reshape(3, 2, 2)
+    found = guard.restrain(deep, 3 + deep[..., :1], at)
+    assert [part.shape[3:] for part in found[:3]] == [(1,), (2,), ()]
+    for one, other in zip(found, flat, strict=True):
+        torch.testing.assert_close(one.reshape(other.shape), other, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(guard.margins(deep, at).reshape(12, 2), margins)
+    torch.testing.assert_close(guard(deep, at), found.control)
     torch.testing.assert_close(guard(x[3], float(t[3])), flat.control[3])
-    torch.testing.assert_close(guard.margins(x, 0.0), guard.margins(x))
     assert guard.margins(x[3], float(t[3])).shape == (2,)
-    for wrong in ({"x": x[:, :1]}, {"u": x}):
-        with pytest.raises(ValueError, match=rf"`SafetyFilter\({next(iter(wrong))}=...\)`"):
-            guard.restrain(**{"x": x, "u": x[:, :1], "t": 0.0} | wrong)
+    with pytest.raises(ValueError, match=r"`SafetyFilter\(u=...\)`"):
+        guard.restrain(x, x, 0.0)
 
 
 def test_a_report_is_that_of_every_step_of_the_loop() -> None:
@@ -418,7 +262,7 @@ def test_a_report_is_that_of_every_step_of_the_loop() -> None:
     assert 0 < acted < 10
 
 
-def test_what_stands_behind_it_has_its_own_columns_and_value() -> None:
+def test_a_filter_behind_a_filter_is_a_policy_like_any_other() -> None:
     inner = adp.SafetyFilter(adp.LQR(LINE, COST), LINE, lambda x, t: x[:, 0] + 9.0, dt=0.05)
     outer = adp.SafetyFilter(inner, LINE, wall, dt=0.05)
     alone = adp.SafetyFilter(adp.LQR(LINE, COST), LINE, wall, dt=0.05)
@@ -426,33 +270,12 @@ def test_what_stands_behind_it_has_its_own_columns_and_value() -> None:
     run, other = (adp.simulate(guard, LINE, COST, x0, steps=2, compile=False) for guard in (outer, alone))
     assert torch.equal(run.state, other.state)
     assert outer.report(run) == alone.report(other)
-    learner = adp.ActorCritic(adp.QuadraticBasis(2), LINE, COST, adp.RandomPoints(1, half_width=0.5))
-    guard = adp.SafetyFilter(learner, LINE, wall, dt=0.05)
-    assert (guard.draws, guard.label) == (learner.draws, f"filtered {learner.label}")
-    torch.testing.assert_close(
-        guard.value(x0, guard.recorded(guard.init(x0))), learner.basis.value(learner.init(x0).critic, x0)
-    )
-
-
-def test_a_decay_of_one_over_the_hold_is_taken_and_more_where_the_degree_is_one() -> None:
-    both = [lambda x, t: x[:, 0], lambda x, t: x[:, 1]]
-    assert adp.SafetyFilter(lambda x: x[..., :1], LINE, both, dt=0.125, decay=[8.0, 80.0]).degree == (2, 1)
-    with pytest.raises(ValueError, match="must be at most 1/dt = 8 where"):
-        adp.SafetyFilter(lambda x: x[..., :1], LINE, both, dt=0.125, decay=[8.1, 1.0])
 
 
 def test_degrees_may_be_stated_for_all_or_each() -> None:
     both = [lambda x, t: 1 - x[:, 0], lambda x, t: 1 - x[:, 1]]
-    for degree, found in ((1, (1, 1)), ([2, 1], (2, 1)), ([1, 2], (1, 2)), ((2, 2), (2, 2))):
+    for degree, found in ((1, (1, 1)), ([2, 1], (2, 1)), ([1, 2], (1, 2))):
         assert adp.SafetyFilter(lambda x: x[..., :1], LINE, both, dt=0.1, degree=degree).degree == found
-    for wrong in (0, 3, [1], [1, 2, 1], [1, 3], []):
-        with pytest.raises(
-            ValueError, match=r"`SafetyFilter\(degree=...\)` must be 1 or 2, one a constraint"
-        ):
-            adp.SafetyFilter(lambda x: x[..., :1], LINE, both, dt=0.1, degree=wrong)
-    third = systems.Linear([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0] * 3], [[0.0], [0.0], [1.0]])
-    with pytest.raises(ValueError, match="neither first nor second derivative of number 1, at 32 states"):
-        adp.SafetyFilter(lambda x: x[..., :1], third, [lambda x, t: x[:, 2], lambda x, t: x[:, 0]], dt=0.1)
 
 
 @pytest.mark.parametrize("begin", [0.05, 50.0])

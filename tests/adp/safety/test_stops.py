@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import logging
 import math
-from pathlib import Path
 
 import pytest
 import torch
 from helpers import tensor
 from torch import Tensor
 
-from staf_torch import adp, deploy, systems
-from staf_torch.deploy.c_header import runner_c
+from staf_torch import adp, systems
 
 LINE = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
 COST = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
@@ -46,7 +44,7 @@ def test_the_brakes_may_have_two_sides_and_a_moving_wall() -> None:
     x0 = tensor([[0.9, 1.0], [0.0, -3.0], [0.5, 2.0], [-0.9, -1.5]])
     sides = [lambda x, t: 1.5 - 0.3 * t - x[:, 0], lambda x, t: 1 + x[:, 0]]
     guard = adp.SafetyFilter(pushing, LINE, sides, dt=0.02, low=-20.0, high=20.0)
-    report = guard.report(adp.simulate(guard, LINE, COST, x0, steps=60, compile=True))
+    report = guard.report(adp.simulate(guard, LINE, COST, x0, steps=40, compile=True))
     assert report["minimum_margin"] >= 0
     assert report["infeasible"] == []
 
@@ -63,8 +61,7 @@ class Drag(systems.ControlAffineSystem):
         return torch.tensor([[0.0], [1.0]]).to(x).expand(*x.shape, 1)
 
 
-@pytest.mark.needs_compiler
-def test_brakes_that_vary_are_followed_until_they_stop(tmp_path: Path) -> None:
+def test_brakes_that_vary_are_followed_until_they_stop() -> None:
     speed = tensor([2.0, 4.0, 2.0, 4.0, 6.0])
     way = 2 * (speed - 30 * torch.log1p(speed / 30))
     x0 = torch.stack((1 - way * tensor([1.01, 1.01, 0.9, 0.9, 1.01]), speed), dim=-1)
@@ -74,13 +71,6 @@ def test_brakes_that_vary_are_followed_until_they_stop(tmp_path: Path) -> None:
     assert report["infeasible"] == [2, 3]
     assert bool((reached[[0, 1, 4]] <= 1).all())
     torch.testing.assert_close(reached[2:4], 1 + 0.1 * way[2:4], rtol=0, atol=2e-3)
-    policy = deploy.policy_of(
-        adp.SafetyFilter(adp.LQR(Drag(), COST), Drag(), wall, dt=0.02, low=-1.0, high=1.0)
-    )
-    z = torch.cat((x0, tensor([[0.0, 0.5], [-2.0, 0.1]])))
-    deploy.export_c(policy, z[:1], tmp_path / "guard.h", ["control"])
-    (control,) = runner_c(tmp_path / "guard.h", [1], torch.float64)(z)
-    torch.testing.assert_close(control, policy(z), rtol=0, atol=1e-9)
 
 
 def test_two_inputs_brake_before_a_disc() -> None:
@@ -107,7 +97,7 @@ def test_a_drift_stronger_than_the_brakes_is_kept_out_of() -> None:
         dt=0.02, low=-1.0, high=1.0,
     )  # fmt: skip
     cost = adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1)
-    run = adp.simulate(guard, guard.plant, cost, tensor([[0.0], [0.9], [1.1]]), steps=200, compile=True)
+    run = adp.simulate(guard, guard.plant, cost, tensor([[0.0], [0.9], [1.1]]), steps=100, compile=True)
     assert float(run.state[:2].max()) <= 1
     assert guard.report(run)["infeasible"] == [2]
 
