@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import re
 import subprocess
 import tempfile
 from pathlib import Path
@@ -11,16 +10,6 @@ from pathlib import Path
 from staf_torch.lanes.device.cuda import MachineCode, best, measured
 
 ARCHITECTURES = (80, 90, 100)
-RECORDED = Path(__file__).with_name("benchmarks") / "registers.txt"
-
-
-def recorded(name: str, dtype: str, architecture: int) -> list[tuple[int, ...]]:
-    """Registers, bytes spilled and of stack that are recorded of the kernels of a case of `tests/gpu.py`."""
-    lines = [line for line in RECORDED.read_text().splitlines() if line.startswith(f"{name:28} {dtype} ")]
-    found = (
-        re.search(rf"sm_{architecture} (\d+) registers (\d+) spilled (\d+) stack", line) for line in lines
-    )
-    return [tuple(map(int, each.groups())) for each in found if each is not None]
 
 
 def ptxas(text: str, architectures: tuple[int, ...] = ARCHITECTURES) -> dict[int, MachineCode]:

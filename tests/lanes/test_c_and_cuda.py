@@ -9,18 +9,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import gpu_cases as cases
 import pytest
 import torch
 from recorded import Record
-from registers import ptxas, recorded
+from registers import ptxas
 from torch import Tensor
 
-from staf_torch import StaFBasis, adp, centers, chase_weights, kernels, lanes, optim, systems, targets
-from staf_torch.adp.loop.step import ClosedLoop
+from staf_torch import StaFBasis, centers, chase_weights, kernels, lanes, optim, targets
 from staf_torch.lanes.trace import philox
-from staf_torch.metrics.ball_error import StateErrorPass
-from staf_torch.optim.objective import NativeError, Precomputed
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-O0", "-shared", "-fPIC")
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no C compiler")
@@ -58,14 +54,13 @@ def pointer(tensor: Tensor) -> ctypes.c_void_p:
 
 
 @needs_gcc
-@pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 2e-5)])
-def test_c_of_a_step_is_the_definition(dtype: torch.dtype, bound: float, tmp_path: Path) -> None:
+def test_c_of_a_step_is_the_definition(tmp_path: Path) -> None:
+    dtype, bound = torch.float32, 2e-5
     carry, u, row = given(1, dtype)
     program = lanes.Program(flow)
     text = program.c_source("flow", carry, u, row, outputs=["high", "size"], note="Of a test: */ too.")
-    kind = "float" if dtype == torch.float32 else "double"
-    text += f"void begin(flow_state *s) {{ flow_start(s); }}\nvoid call(flow_state *s, const {kind} *u, "
-    text += f"const {kind} *g, {kind} *h, {kind} *z) {{ flow(s, u, g, h, z); }}\n"
+    text += "void begin(flow_state *s) { flow_start(s); }\nvoid call(flow_state *s, const float *u, "
+    text += "const float *g, float *h, float *z) { flow(s, u, g, h, z); }\n"
     library = built(text, tmp_path, "flow.c", ("gcc", *STRICT))
     state, high, size = (
         torch.empty(4, dtype=dtype),
@@ -83,10 +78,9 @@ def test_c_of_a_step_is_the_definition(dtype: torch.dtype, bound: float, tmp_pat
 
 
 @needs_gcc
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_random_numbers_of_a_seed_and_a_step_are_the_same_on_every_back_end(
-    dtype: torch.dtype, tmp_path: Path
-) -> None:
+def test_random_numbers_of_a_seed_and_a_step_are_the_same_on_every_back_end(tmp_path: Path) -> None:
+    dtype = torch.float32  # of which a step's number has more digits than fit
+
     def step(time: Tensor, now: Any, seed: Tensor) -> tuple[Tensor, Tensor]:
         return time + 1, philox.uniform(seed, time, 3)
 
@@ -100,9 +94,8 @@ def test_random_numbers_of_a_seed_and_a_step_are_the_same_on_every_back_end(
     with lanes.device.host():
         assert program(begin, (), seeds, steps=4)[1].equal(wanted)
     text = program.c_source("draw", begin, (), seeds)
-    kind = "float" if dtype == torch.float32 else "double"
     text += "void begin(draw_state *s) { draw_start(s); }\n"
-    text += f"void call(draw_state *s, const {kind} *r, {kind} *u) {{ draw(s, r, u); }}\n"
+    text += "void call(draw_state *s, const float *r, float *u) { draw(s, r, u); }\n"
     library = built(text, tmp_path, "draw.c", ("gcc", *STRICT))
     state, found = torch.empty(1, dtype=dtype), torch.empty(4, 3, dtype=dtype)
     library.begin(pointer(state))
@@ -124,35 +117,6 @@ def test_words_are_the_known_answers_of_random123() -> None:
         assert " ".join(f"{int(one):08x}" for one in philox.words([word] * 4, [word] * 2)) == known
 
 
-@needs_gcc
-@pytest.mark.parametrize("law", [optim.ConjugateGradient(), optim.BarzilaiBorwein()])
-def test_c_of_a_learning_step_is_the_definition(law: optim.UpdateLaw, tmp_path: Path) -> None:
-    factor = torch.randn(1, 4, 6, 6, dtype=torch.float64)
-    gram = factor @ factor.mT + 5 * torch.eye(6, dtype=torch.float64)
-    values, weights = torch.randn(1, 4, 6, dtype=torch.float64), torch.zeros(1, 6, dtype=torch.float64)
-
-    def step(carry: Any, now: Any, _: Any) -> Any:
-        gram, values = now
-        objective = NativeError(
-            gram, values, Precomputed(extremes=torch.tensor([1.0, 50.0], dtype=torch.float64))
-        )
-        carry = carry[0], law.begin(objective, *carry)
-        carry = lanes.repeat(2, lambda c: law.step(objective, *c), carry)
-        return carry, carry[0]
-
-    program = lanes.Program(step)
-    start = weights, law.init(weights)
-    text = program.c_source("learn", start, (gram, values))
-    text += "void begin(learn_state *s) { learn_start(s); }\n"
-    text += "void call(learn_state *s, const double *g, const double *v, double *w) { learn(s, g, v, w); }\n"
-    library = built(text, tmp_path, "learn.c", ("gcc", *STRICT))
-    state, found = torch.empty(100, dtype=torch.float64), torch.empty(4, 6, dtype=torch.float64)
-    library.begin(pointer(state))
-    for k in range(4):
-        library.call(*map(pointer, (state, gram[0, k], values[0, k], found[k])))
-    torch.testing.assert_close(found, program.definition(start, (gram, values))[1][0], rtol=1e-12, atol=1e-12)
-
-
 def moved(carry: Any, now: Any, row: Any) -> tuple[Any, Any]:
     return {"x": carry["x"] + now * row["gain"]}, (carry["x"], now)
 
@@ -171,7 +135,7 @@ def test_a_header_starts_with_the_first_row_and_has_the_names_of_its_trees() -> 
     assert "double a[2], double b[2])" in named
 
 
-@pytest.mark.parametrize("name", ["9x", "state", "t3", "a-b", "double"])
+@pytest.mark.parametrize("name", ["9x", "state", "double"])
 def test_a_name_that_c_does_not_take_is_refused(name: str) -> None:
     program = lanes.Program(lambda x, _, __: (x, x))
     with pytest.raises(ValueError, match=rf"`c_source\(outputs=...\)` must .*; got '{name}'"):
@@ -205,10 +169,9 @@ def test_the_text_of_a_small_program_is_the_recorded(name: str, record: Record) 
         record({"torch": VERSION, "text": TEXTS[name]()})
 
 
-@pytest.mark.parametrize(("dtype", "bound"), [(torch.float64, 1e-12)])
-def test_a_kernel_on_the_host_is_the_definition(dtype: torch.dtype, bound: float) -> None:
+def test_a_kernel_on_the_host_is_the_definition() -> None:
     """No device is needed: g++ compiles the kernel, a loop is the grid."""
-    carry, u, row = given(37, dtype)
+    carry, u, row = given(37, torch.float64)
     program = lanes.Program(flow)
     for every in (1, 4):
         with lanes.device.host():
@@ -216,7 +179,7 @@ def test_a_kernel_on_the_host_is_the_definition(dtype: torch.dtype, bound: float
         wanted, outs = program.definition(carry, u, row, every=every)
         for one, other in zip((*end.values(), *out), (*wanted.values(), *outs), strict=True):
             assert one.dtype == other.dtype
-            torch.testing.assert_close(one, other, rtol=bound, atol=bound)
+            torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12)
 
 
 def test_results_lie_rows_innermost_and_those_without_room_are_refused() -> None:
@@ -233,7 +196,7 @@ def test_results_lie_rows_innermost_and_those_without_room_are_refused() -> None
 def test_a_chase_that_is_made_again_is_one_kernel() -> None:
     """Nothing is computed around it and nothing is read from the device; what has changed is noticed."""
     basis = StaFBasis(kernels.ExponentialKernel(), centers.StateFollowingCenters(DIRECTIONS, 0.3))
-    states = 0.3 * torch.randn(5, 20, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    states = 0.3 * torch.randn(5, 6, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
 
     law, paper = optim.Nesterov(), targets.Paper()
 
@@ -260,102 +223,12 @@ def test_a_chase_that_is_made_again_is_one_kernel() -> None:
         torch.testing.assert_close(again(states), defined(states), rtol=1e-12, atol=1e-12)
     assert len(texts) == 1
     if shutil.which("nvcc") is not None:
-        assert all(of.spilled == 0 for of in ptxas(texts[0]).values())
-
-
-@pytest.mark.skipif(shutil.which("nvcc") is None, reason="no compiler of CUDA")
-@pytest.mark.parametrize("dtype", [torch.float32])
-def test_kernels_compile_and_keep_their_numbers_in_registers(dtype: torch.dtype) -> None:
-    for of in ptxas(lanes.Program(flow).cuda_source(*given(2, dtype))).values():
+        of = ptxas(texts[0], (90,))[90]  # of all kernels `python -m tests.gpu --ptxas` tells it
         assert 0 < of.registers < 255
         assert of.spilled == 0
 
 
-KERNELS = {
-    "M = 15 jacobi": cases.weights(15, "jacobi", 16),
-}
-
-
-@pytest.mark.skipif(shutil.which("nvcc") is None, reason="no compiler of CUDA")
-@pytest.mark.parametrize("name", KERNELS)
-def test_kernels_spill_no_more_than_is_recorded(name: str) -> None:
-    """Of all there are, `python -m tests.gpu --ptxas` tells it, in minutes."""
-    torch.manual_seed(0)
-    case = KERNELS[name](3, torch.float64)
-    with lanes.compiling("always"), lanes.device.recorded() as texts:
-        case.call(*case.inputs)
-    known = recorded(name, "float64", 90)
-    assert len(known) == len(texts)
-    for text, (_, spilled, stack) in zip(texts, known, strict=True):
-        of = ptxas(text, (90,))[90]
-        assert of.spilled <= spilled
-        assert of.stack <= stack
-
-
-# No step reads a tensor back to the host: on the meta device, which has no numbers, that would raise.
-
 DIRECTIONS = torch.tensor([[1.0, 0.0], [-0.5, 0.8], [-0.5, -0.8]], dtype=torch.float64)
-
-
-@pytest.mark.parametrize(
-    ("kernel", "radius", "law"),
-    [
-        (kernels.ExponentialKernel(), 0.3, optim.ConjugateGradient()),
-        (kernels.GaussianKernel(1.0), centers.StateRadius(0.7, 0.01), optim.Nesterov()),
-    ],
-)
-def test_a_chase_on_a_device_stays_there(kernel: Any, radius: Any, law: optim.UpdateLaw) -> None:
-    following = centers.StateFollowingCenters(DIRECTIONS, radius)
-
-    def step(carry: Any, x: Tensor, _: Any) -> Any:
-        near = following(x)
-        gram = kernel(near, near)
-        objective = NativeError(gram, near.square().sum(-1), Precomputed(extremes=torch.ones_like(x) * 2.0))
-        carry = carry[0], law.begin(objective, *carry)
-        carry = lanes.repeat(2, lambda c: law.step(objective, *c), carry)
-        return carry, carry[0]
-
-    states = torch.empty(5, 4, 2, dtype=torch.float64, device="meta")
-    weights = states.new_empty(5, 3)
-    end, history = lanes.Program(step)((weights, law.init(weights)), states)
-    assert end[0].device.type == history.device.type == "meta"
-    assert history.shape == (5, 4, 3)
-
-
-def test_the_meta_device_notices_a_value_that_is_read() -> None:
-    x = torch.empty(3, 2, device="meta")
-    with pytest.raises((RuntimeError, NotImplementedError), match="meta"):
-        lanes.Program(lambda x, _, __: (x if bool((x > 0).all()) else -x, ()))(x, steps=1)
-
-
-@pytest.mark.parametrize(
-    ("kernel", "radius"),
-    [(kernels.ExponentialKernel, centers.StateRadius(0.7, 0.01)), (kernels.MaternKernel, 0.3)],
-)
-def test_the_errors_around_states_on_a_device_stay_there(kernel: Any, radius: Any) -> None:
-    basis = StaFBasis(kernel(), centers.StateFollowingCenters(DIRECTIONS, radius)).to("meta")
-    x = torch.empty(3, 6, 2, dtype=torch.float64, device="meta")
-    ideal = basis.ideal_weights(x, targets.Paper())
-    errors = StateErrorPass(basis, targets.Paper())(x, ideal, ideal)
-    assert {(part.device.type, tuple(part.shape)) for part in errors} == {("meta", (3, 6))}
-
-
-@pytest.mark.parametrize("law", [adp.Information, adp.Published])
-def test_a_learning_closed_loop_on_a_device_stays_there(law: Any) -> None:
-    plant, cost = systems.TwoState(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
-    following = centers.StateFollowingCenters(DIRECTIONS, centers.StateRadius(0.7, 1e-5))
-    basis = adp.StaFValueBasis(StaFBasis(kernels.AnchoredKernel(kernels.ExponentialKernel()), following))
-    points = adp.RandomPoints(1, centers.StateRadius(2.1, 1e-5))
-    loop = ClosedLoop(adp.ActorCritic(basis, plant, cost, points, law()), plant, cost, dt=1e-3).to("meta")
-    x0 = torch.empty(3, 2, dtype=torch.float64, device="meta")
-    state, u = loop(loop.init(x0), x0.new_empty(3, loop.controller.draws, 2))
-    assert {part.device.type for part in (u, state.x, state.alive, state.cost, *state.carried)} == {"meta"}
-
-
-def test_a_rollout_policy_on_a_device_stays_there() -> None:
-    plant, cost = systems.TwoState(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
-    policy = adp.RolloutPolicy.of_lqr(plant, cost, steps=2).to("meta")
-    assert policy(torch.empty(3, 2, dtype=torch.float64, device="meta")).device.type == "meta"
 
 
 def test_numbers_that_no_table_can_hold_stay_in_the_text_and_the_log_says_so(

@@ -90,20 +90,18 @@ def calls(cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Calla
 
 
 def test_a_program_is_built_once_for_all_processes(cache: Path, calls: Callable[[], Sequence[str]]) -> None:
-    program = new_program()
-    in_children(lambda: right(program))
-    in_children(lambda: right(program), lambda: right(program))
-    right(program)
-    right(lanes.Program(program.step, name="another of the same text"))
-    (command,) = calls()
-    assert {"-march=native", "-ffp-contract=off"} <= {*command.split()}  # rounding is as it is written down
-    assert [path.suffix for path in programs(cache)] == [".so"]  # and nothing is left beside it
-
-
-def test_processes_that_build_the_same_at_once_do_not_disturb_each_other(cache: Path) -> None:
+    """Or once by each of several that begin at once."""
     program = new_program()
     in_children(*[lambda: right(program)] * 2)
-    assert [path.suffix for path in programs(cache)] == [".so"]
+    commands = calls()
+    assert 1 <= len(commands) <= 2
+    assert {"-march=native", "-ffp-contract=off"} <= {*commands[0].split()}  # rounding is as it is written
+    (path,) = programs(cache)  # and nothing is left beside it
+    os.utime(path, (1e9, 1e9))
+    right(program)
+    right(lanes.Program(program.step, name="another of the same text"))
+    assert calls() == commands
+    assert path.stat().st_mtime > 1e9 + 1  # what is in use is noted so that it stays
 
 
 def test_other_options_and_another_compiler_are_another_library(
@@ -114,38 +112,15 @@ def test_other_options_and_another_compiler_are_another_library(
     monkeypatch.setenv("CXXFLAGS", f"{os.environ['CXXFLAGS']} -DNOTHING=1")
     in_children(lambda: right(program))
     assert calls()[1].index("-O0 -DNOTHING=1") > calls()[1].index("-O2")  # the last one holds
-    newer = script(
-        tmp_path / "newer", f'[ "$1" = --version ] && echo newer && exit; exec {os.environ["CXX"]} "$@"'
-    )
+    newer = script(tmp_path / "newer", '[ "$1" = --version ] && echo newer && exit; exit 1')
     monkeypatch.setenv("CXX", str(newer))
-    in_children(lambda: right(program))
-    assert len(calls()) == len(list(cache.glob("lanes-*.so"))) == 3
-
-
-DAMAGES: dict[str, Callable[[bytes], bytes]] = {
-    "half": lambda content: content[: len(content) // 2],
-    "a byte changed": lambda content: content[:100] + bytes([content[100] ^ 1]) + content[101:],
-}
-
-
-def test_a_damaged_library_is_built_again_and_never_loaded(
-    cache: Path, calls: Callable[[], Sequence[str]]
-) -> None:
-    program = new_program()
-    in_children(lambda: right(program))
-    (path,) = programs(cache)
-    whole = path.read_bytes()
-    for count, damage in enumerate(DAMAGES.values(), start=2):
-        path.write_bytes(damage(whole))
-        in_children(lambda: right(program))
-        assert len(calls()) == count
-        assert len(path.read_bytes()) == len(whole)
+    assert not lanes.Program(program.step, name="by a newer one").compiles(X, steps=2)
+    assert len(list(cache.glob("lanes-*.so"))) == 2
 
 
 FAULTS: dict[str, tuple[dict[str, str], str]] = {
     "no compiler": ({"PATH": "/nonexistent", "CXX": ""}, "none of g++, c++, clang++ is on the path"),
     "a compiler that fails": ({"CXX": "/bin/false"}, "failed"),
-    "a compiler that refuses the text": ({"CXXFLAGS": "-include no_such_file.hpp"}, "no_such_file.hpp"),
     "a compiler that hangs": ({"STAF_COMPILE_SECONDS": "0.2"}, "took more than 0.2 s"),
     "a limit that is none": (
         {"STAF_COMPILE_SECONDS": "2m"},
@@ -199,15 +174,20 @@ def test_a_cache_serves_where_there_is_no_compiler_also_one_that_nobody_may_writ
     """A container to which a cache was copied, of another compiler's and with other flags, on any kernel."""
     program, never_built = new_program(), new_program("a program that was never built")
     in_children(lambda: right(program))
-    monkeypatch.setenv("PATH", "/nonexistent")
-    monkeypatch.delenv("CXXFLAGS")
-    monkeypatch.setattr(os, "access", lambda *_: False)
-    monkeypatch.setattr(platform, "platform", lambda: "another kernel")
-    in_children(lambda: right(program))
-    assert not never_built.compiles(X, steps=2)
     (library,) = programs(cache)
-    library.write_bytes(DAMAGES["half"](library.read_bytes()))
-    assert not lanes.Program(program.step, name="a program that was damaged").compiles(X, steps=2)
+    whole = library.read_bytes()
+    with monkeypatch.context() as there:
+        there.setenv("PATH", "/nonexistent")
+        there.delenv("CXXFLAGS")
+        there.setattr(os, "access", lambda *_: False)
+        there.setattr(platform, "platform", lambda: "another kernel")
+        in_children(lambda: right(program))
+        assert not never_built.compiles(X, steps=2)
+        for damaged in (whole[: len(whole) // 2], whole[:100] + bytes([whole[100] ^ 1]) + whole[101:]):
+            library.write_bytes(damaged)
+            assert not lanes.Program(program.step, name="a damaged one").compiles(X, steps=2)
+    in_children(lambda: right(program))  # built again
+    assert len(library.read_bytes()) == len(whole)
 
 
 FOREIGN: dict[str, tuple[Callable[[Path], None], str]] = {
@@ -220,24 +200,27 @@ FOREIGN: dict[str, tuple[Callable[[Path], None], str]] = {
 def test_nothing_is_loaded_that_somebody_else_may_have_written(
     kind: str, cache: Path, caplog: pytest.LogCaptureFixture, calls: Callable[[], Sequence[str]]
 ) -> None:
+    """Neither a library nor a folder."""
     if "user" in kind and os.geteuid() != 0:
         pytest.skip("only root can give a file away")
     change, reason = FOREIGN[kind]
-    program = new_program()
-    in_children(lambda: right(program))
-    (library,) = programs(cache)
-    assert library.stat().st_mode & 0o022 == 0
-    change(library)
-    right(program)  # from a library of its own
-    assert len(calls()) == 2
-    assert [path.stat().st_uid for path in programs(cache)] == [os.geteuid()]
-    change(cache)
-    before = {path: path.stat().st_mtime_ns for path in cache.iterdir()}
-    right(new_program())
-    assert folder_of.cache() != cache
-    assert {path: path.stat().st_mtime_ns for path in cache.iterdir()} == before
-    for line, path in zip(caplog.messages, (library, cache), strict=True):
-        assert re.match(rf"{path} is not used, as machine code is run from there: {reason}", line)
+    program, path = new_program(), cache
+    if "user" in kind:
+        in_children(lambda: right(program))
+        (path,) = programs(cache)
+        assert path.stat().st_mode & 0o022 == 0
+        change(path)
+        right(program)  # from a library of its own
+        assert len(calls()) == 2
+        assert [each.stat().st_uid for each in programs(cache)] == [os.geteuid()]
+    else:
+        cache.mkdir(parents=True)
+        change(cache)
+        right(program)
+        assert folder_of.cache() != cache
+        assert not [*cache.iterdir()]
+    (line,) = caplog.messages
+    assert re.match(rf"{path} is not used, as machine code is run from there: {reason}", line)
 
 
 def test_what_a_killed_process_left_is_swept_and_what_one_builds_now_is_not(cache: Path) -> None:
@@ -294,26 +277,11 @@ def test_checkouts_of_one_version_share_a_library_and_others_do_not(
         found.append(function())
     assert found == [10, 10, 12]
     assert len(calls()) == 2
-    compiler.compiled(tmp_path / "one" / "_seven.cpp", "N=4")
-    assert len(calls()) == 3
 
 
-def test_a_file_that_cannot_be_compiled_is_none_and_said_once(
-    cache: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    for definition in ("N=1", "N=2"):
-        (tmp_path / "_unwritten.cpp").write_text("this is no C++")
-        assert compiler.compiled(tmp_path / "_unwritten.cpp", definition) is None
-    (line,) = caplog.messages
-    assert "unwritten" in line
-    assert "plain torch" in line
-
-
-@pytest.mark.parametrize("name", ["g++", "clang++"])
-def test_a_long_program_is_built_by_every_compiler(
-    name: str, cache: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_long_program_is_built_by_another_compiler(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Options that spare one compiler half of its time are errors to another."""
+    name = "clang++"
     if shutil.which(name) is None:
         pytest.skip(f"there is no {name} here")
     monkeypatch.setenv("CXX", name)
@@ -349,12 +317,3 @@ def test_the_cache_forgets_what_nobody_has_used_and_nothing_of_today(tmp_path: P
     folder_of.used(tmp_path / "absent")  # nothing to note
     folder_of.prune(tmp_path)  # by the clock of the machine the others are old
     assert {path.name for path in tmp_path.iterdir()} == {"lanes-new.so", "notes.txt"}
-
-
-def test_what_is_in_use_is_noted_so_that_it_stays(cache: Path) -> None:
-    program = new_program()
-    in_children(lambda: right(program))
-    (path,) = programs(cache)
-    os.utime(path, (1e9, 1e9))
-    right(program)
-    assert path.stat().st_mtime > 1e9 + 1

@@ -10,7 +10,7 @@ import hypothesis.strategies as st
 import pytest
 import torch
 from helpers import random_positive_definite, uniform
-from hypothesis import given
+from hypothesis import given, settings
 from torch import Tensor
 
 from staf_torch import lanes
@@ -29,7 +29,6 @@ from staf_torch.lanes.trace.factorisations import (
 from staf_torch.numerics.linalg import condition_number
 from staf_torch.numerics.pivoted_cholesky import pivoted_cholesky
 
-LEADS = ((), (2,), (2, 3))
 SEEDS = st.integers(0, 2**31)
 
 
@@ -88,9 +87,14 @@ def pairs(size: int, lead: tuple[int, ...], dtype: torch.dtype) -> Iterator[tupl
     yield from zip(log_determinant(-a), torch.linalg.slogdet(-a), strict=True)
 
 
-@pytest.mark.parametrize("lead", LEADS)
 @pytest.mark.parametrize(
-    ("size", "dtype"), [(1, torch.float64), (2, torch.float32), (4, torch.float64), (9, torch.float64)]
+    ("size", "lead", "dtype"),
+    [
+        (1, (2,), torch.float64),
+        (2, (2, 3), torch.float32),
+        (4, (), torch.float64),
+        (9, (2, 3), torch.float64),
+    ],
 )
 def test_factorisations_of_any_batch_are_those_of_torch(
     size: int, lead: tuple[int, ...], dtype: torch.dtype
@@ -149,8 +153,9 @@ def matrices(size: int, dtype: torch.dtype = torch.float64) -> torch.Tensor:
     return some
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("size", [1, 2, 3, 6, 15])
+@pytest.mark.parametrize(
+    ("size", "dtype"), [(1, torch.float64), (2, torch.float32), (3, torch.float64), (15, torch.float32)]
+)
 def test_eigenvalues_are_those_of_lapack_to_rounding_of_the_largest(size: int, dtype: torch.dtype) -> None:
     given = matrices(size, dtype)
     wanted = torch.linalg.eigvalsh(given.double())
@@ -166,7 +171,7 @@ def test_eigenvalues_of_a_row_that_is_not_finite_are_nan() -> None:
     assert torch.isfinite(found[:4]).all()
 
 
-@pytest.mark.parametrize("size", [1, 2, 5, 13])
+@pytest.mark.parametrize("size", [2, 13])
 def test_a_definite_system_is_solved_to_the_rounding_of_its_condition(size: int) -> None:
     torch.manual_seed(size)
     some, right = torch.randn(9, size, size).double(), torch.randn(9, size).double()
@@ -252,6 +257,7 @@ def reassembled(gram: torch.Tensor) -> torch.Tensor:
     return rows @ rows.mT
 
 
+@settings(max_examples=25)
 @given(seed=SEEDS, size=st.integers(1, 9), data=st.data())
 def test_a_factor_reproduces_its_matrix_and_knows_the_rank(seed: int, size: int, data: st.DataObject) -> None:
     rank = data.draw(st.integers(1, size))
@@ -262,13 +268,9 @@ def test_a_factor_reproduces_its_matrix_and_knows_the_rank(seed: int, size: int,
     assert torch.equal(found.factor, found.factor.tril())
     near = (1e-14 if whole else 1e-13) * size * float(gram.abs().max())
     torch.testing.assert_close(reassembled(gram), gram, rtol=0, atol=near)
-
-
-@given(seed=SEEDS, size=st.integers(1, 8))
-def test_solves_invert_the_matrix(seed: int, size: int) -> None:
-    gram = random_positive_definite(seed, 3, size=size)
+    if not whole:
+        return
     values = uniform(3, size, seed=seed)
-    found = pivoted_cholesky(gram)
     solved = found.solve_upper(found.solve_lower(values))
     torch.testing.assert_close((gram @ solved.unsqueeze(-1)).squeeze(-1), values, rtol=0, atol=1e-11)
     beta = found.solve_lower(values)  # |beta|^2 = v'K^-1 v, the squared native norm of the interpolant
@@ -297,11 +299,10 @@ def test_batch_equals_loop() -> None:
         torch.testing.assert_close(solved[row], own, rtol=1e-13, atol=0)
 
 
-@pytest.mark.parametrize("poison", [torch.nan, torch.inf])
-def test_a_matrix_that_is_not_finite_has_rank_zero_and_spoils_no_other(poison: float) -> None:
+def test_a_matrix_that_is_not_finite_has_rank_zero_and_spoils_no_other() -> None:
     clean = random_positive_definite(1, 4, size=4)
     gram = clean.clone()
-    gram[2, 1, 3] = gram[2, 3, 1] = poison
+    gram[2, 1, 3] = gram[2, 3, 1] = torch.inf
     found, expected = pivoted_cholesky(gram), pivoted_cholesky(clean)
     assert found.rank.tolist() == [4, 4, 0, 4]
     others = [0, 1, 3]

@@ -112,7 +112,9 @@ def check(found: Any, wanted: Any) -> None:
     for k, (one, other) in enumerate(zip([found[0], *found[1]], [wanted[0], *wanted[1]], strict=True)):
         assert one.dtype == other.dtype, k
         bound = 0.0 if one.dtype == torch.float32 else 1e-13
-        torch.testing.assert_close(one, other, rtol=bound, atol=bound, msg=lambda m, k=k: f"{k}: {m}")
+        torch.testing.assert_close(
+            one, other, rtol=bound, atol=bound, equal_nan=True, msg=lambda m, k=k: f"{k}: {m}"
+        )
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -120,6 +122,8 @@ def test_a_program_of_both_dtypes_rounds_as_its_definition(seed: int) -> None:
     """float32 results to the bit, float64 ones to rounding."""
     program = lanes.Program(drawn(seed), copies=1)
     inputs = given(seed, 9)
+    for k, special in enumerate((torch.nan, torch.inf, -0.0, 5e-324, 1e300)):
+        inputs[0][k, 0] = special
     assert program.compiles(*inputs)
     check(program(*inputs), program.definition(*inputs))
 
@@ -164,7 +168,7 @@ def test_functions_of_float32_are_within_two_units_in_the_last_place() -> None:
         torch.testing.assert_close(one, other, rtol=2 * torch.finfo(torch.float32).eps, atol=1e-30)
 
 
-@pytest.mark.parametrize("built", ["before", "within", "never"])
+@pytest.mark.parametrize("built", ["within", "never"])
 def test_autocast_reaches_no_program_no_gradient_and_no_chase(built: str) -> None:
     """Whether code had been built before would decide on the digits, and a fit in bfloat16 has none."""
     net, x, u = nn.Linear(3, 3), torch.randn(4, 3), torch.randn(4, 5, 3)
@@ -182,7 +186,7 @@ def test_autocast_reaches_no_program_no_gradient_and_no_chase(built: str) -> Non
         return loss.detach(), *torch.autograd.grad(loss, tuple(net.parameters()))
 
     with lanes.compiling("never" if built == "never" else "always"):
-        plain = computed(one := lanes.Program(step)), chased()
+        plain = computed(lanes.Program(step)), chased()
         with torch.autocast("cpu", torch.bfloat16):
-            cast = computed(one if built == "before" else lanes.Program(step)), chased()
+            cast = computed(lanes.Program(step)), chased()
     torch.testing.assert_close(cast, plain, rtol=1e-5, atol=1e-6)

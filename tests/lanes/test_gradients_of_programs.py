@@ -66,8 +66,7 @@ def close(found: list[Tensor], wanted: list[Tensor], tolerance: float = 1e-11) -
         torch.testing.assert_close(one, other, rtol=tolerance, atol=tolerance * float(other.abs().max()))
 
 
-@pytest.mark.parametrize("mebibytes", [256, 0.02, 0.001])
-@pytest.mark.parametrize("every", [1, 4])
+@pytest.mark.parametrize(("every", "mebibytes"), [(1, 256), (4, 0.02), (1, 0.001)])
 def test_a_gradient_is_that_of_the_definition_by_all_that_is_read(every: int, mebibytes: float) -> None:
     given = inputs()
     wanted = gradients(EVERYTHING.definition, given, GAIN, MATRIX, OWN, every=every)
@@ -148,8 +147,7 @@ def _set_behind_autograd(result: Tensor) -> None:
     result.detach()[:, 1] = 3
 
 
-@pytest.mark.parametrize("write", [None, _doubled, _set_behind_autograd])
-@pytest.mark.parametrize("after", [False, True])
+@pytest.mark.parametrize(("write", "after"), [(None, True), (_doubled, False), (_set_behind_autograd, True)])
 def test_a_result_that_is_the_carry_may_be_written_over_before_the_backward_pass(
     after: bool, write: Callable[[Tensor], None] | None
 ) -> None:
@@ -246,12 +244,6 @@ def test_a_parameter_in_float64_that_a_step_in_float32_reads_has_its_gradient(ro
             torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-4)
 
 
-def test_a_budget_that_is_none_is_refused() -> None:
-    told = r"gradient_memory\(mebibytes=...\)` must be positive; got 0"
-    with pytest.raises(ValueError, match=told), lanes.gradient_memory(0):
-        pass
-
-
 LARGE, FEW = nn.Parameter(0.3 * drawn(12, 12)), nn.Parameter(drawn(5, 12))
 
 
@@ -321,7 +313,7 @@ def descent(weights: Tensor, target: Tensor, _: Tree) -> tuple[Tensor, Tensor]:
 DESCENT = lanes.Program(descent)
 
 
-@pytest.mark.parametrize(("rows", "times"), [(1, 11), (9, 1), (9, 40), (70, 3)])
+@pytest.mark.parametrize(("rows", "times"), [(1, 11), (70, 3)])
 def test_long_steps_and_inputs_of_times_in_any_layout(rows: int, times: int) -> None:
     dense, weights = drawn(rows, times, 3).requires_grad_(), drawn(rows, 15).requires_grad_()
     apart = drawn(rows, 3, times).mT.detach().requires_grad_()

@@ -20,7 +20,7 @@ import staf_torch as st
 from staf_torch import lanes, optim, systems, targets
 
 X = tensor([[0.5, 0.1], [0.2, -0.3], [-0.4, 0.6]])
-STATES = systems.simulate(systems.Oscillator(), X, dt=0.01, steps=20)
+STATES = systems.simulate(systems.Oscillator(), X, dt=0.01, steps=3)
 
 
 @pytest.fixture(autouse=True)
@@ -68,16 +68,9 @@ def test_a_model_of_a_network_a_program_and_a_loss_is_one_graph_with_the_gradien
     model = Pendulums()
     compiled = whole(model)
     assert same(model, compiled, *model.parameters())
-    for mode in (torch.no_grad, torch.inference_mode):
-        with mode():
-            assert torch.equal(compiled(X), model(X))
-    assert torch.equal(compiled(X[:2]), model(X[:2]))
-
-
-def test_what_a_step_reads_may_change_between_calls_of_a_graph() -> None:
-    model = Pendulums()
-    compiled = whole(model)
-    found = [compiled(X)]
+    with torch.no_grad():
+        assert torch.equal(compiled(X[:2]), model(X[:2]))
+    found = [compiled(X)]  # what a step reads may change between calls
     with torch.no_grad():
         model.gain.mul_(2)
     found.append(compiled(X))
@@ -88,9 +81,8 @@ def test_what_a_step_reads_may_change_between_calls_of_a_graph() -> None:
     assert same(model, compiled, *model.parameters())
     found.append(compiled(X))
     assert len({value.item() for value in found}) == 4
-    for learned in (False, True):
-        model.gain.requires_grad_(learned)
-        assert same(model, compiled, *(each for each in model.parameters() if each.requires_grad))
+    model.gain.requires_grad_(False)
+    assert same(model, compiled, *model.net.parameters())
 
 
 def test_a_gradient_is_that_of_the_numbers_of_its_forward_pass() -> None:
@@ -167,28 +159,24 @@ class Damping(nn.Module):
 POLICY = Damping()
 
 
-def both(x: Tensor) -> Tensor:
+def two(x: Tensor) -> Tensor:
     end, out = LEARNED(x, steps=3)
     moved = DRIVEN(end, torch.ones(3, 4).double(), (lanes.Shared(x[0]),))
     loss: Tensor = moved[0].square().sum() + moved[1][0].sum() + out.mean()
     return loss
 
 
-CALLS: dict[str, Callable[[Tensor], Tensor]] = {
-    "two programs": both,
-    "a checkpoint": lambda x: checkpoint(both, x, use_reentrant=False),
-    "a prepared call": lambda x: PREPARED(x)[1].square().sum(),
-    "a policy": lambda x: POLICY(x).square().sum() + GAIN,
-    "simulate": lambda x: GAIN * systems.simulate(PLANT, x, dt=0.01, steps=30).square().mean(),
-    "chase": lambda x: st.chase(STATES + x[:, None], BASIS, TARGET, LAW).weights.square().mean(),
-    "chase_weights": lambda x: st.chase_weights(STATES + x[:, None], BASIS, TARGET, LAW).weights.mean(),
-}
+def every(x: Tensor) -> Tensor:
+    prepared = PREPARED(x)[1].square().sum()
+    moved = GAIN * systems.simulate(PLANT, x, dt=0.01, steps=12).square().mean() + POLICY(x).square().sum()
+    chased = st.chase(STATES + x[:, None], BASIS, TARGET, LAW).weights.square().mean()
+    weights = st.chase_weights(STATES + x[:, None], BASIS, TARGET, LAW).weights.mean()
+    return checkpoint(two, x, use_reentrant=False) + prepared + moved + chased + weights  # type: ignore[no-any-return]
 
 
-@pytest.mark.parametrize("name", list(CALLS))
-def test_a_call_is_an_operator_of_a_graph(name: str) -> None:
-    call = whole(CALLS[name])  # before anybody else has called it
-    assert same(CALLS[name], call, GAIN)
+def test_a_call_of_any_kind_is_an_operator_of_a_graph() -> None:
+    found, wanted = gradients(whole(every), GAIN), gradients(every, GAIN)
+    torch.testing.assert_close(found, wanted, rtol=1e-12, atol=1e-12)  # sums of slopes are in another order
 
 
 def test_a_change_within_the_graph_is_seen_and_in_one_graph_refused() -> None:
@@ -213,8 +201,7 @@ def test_a_change_within_the_graph_is_seen_and_in_one_graph_refused() -> None:
         other.load_state_dict(model.state_dict())
         broken = torch.compile(change, backend="aot_eager")
         with torch.no_grad():
-            for _ in range(2):
-                assert torch.equal(broken(model, X), change(other, X))
+            assert torch.equal(broken(model, X), change(other, X))
         torch.compiler.reset()
         with pytest.raises(Exception, match="graph_break"):
             whole(change)(model, X)

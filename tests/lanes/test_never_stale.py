@@ -4,8 +4,6 @@ served by what was compiled of it."""
 from __future__ import annotations
 
 import copy
-import ctypes
-import itertools
 import math
 import pickle
 import sys
@@ -146,7 +144,7 @@ def test_a_function_is_computed_with_what_it_reads_at_the_moment(name: str, note
         right(program, function)
 
 
-@pytest.mark.parametrize("name", ["__main__", "this", "namedtuple_of_mine", None])
+@pytest.mark.parametrize("name", ["__main__", "this", None])
 def test_a_script_is_a_users_under_any_name_and_program_that_runs_it(
     name: str | None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -174,8 +172,8 @@ def test_a_tensor_that_is_given_other_memory_is_read_there() -> None:
     """Torch counts no write then: `vector_to_parameters` does so, and memory is soon used again."""
     net, kept = nn.Linear(2, 2, bias=False).double(), SharedPrograms("a test")
     own = Program(lambda x, _, __: (x, net(x)))
-    for k in range(6):
-        for _ in range(1 + k % 3):
+    for k in range(3):
+        for _ in range(1 + k):
             nn.utils.vector_to_parameters(torch.randn(4, dtype=torch.float64), net.parameters())
         for program in (own, of(kept, net)):
             right(program, net)
@@ -206,13 +204,19 @@ UNCOUNTED: dict[str, Callable[[Tensor], object]] = {
 """Writes that torch does not count."""
 
 
-@pytest.mark.parametrize("how", UNCOUNTED)
-@pytest.mark.parametrize("size", [1, 90, 200])
-@pytest.mark.parametrize("learned", [True, False])
+@pytest.mark.parametrize(
+    ("how", "size", "learned"),
+    [
+        ("a target network's copy", 200, True),
+        ("a target network's copy", 90, False),
+        ("an entry of `.data`", 90, True),
+        ("an entry of `.data`", 1, False),
+        ("NumPy", 200, False),
+        ("NumPy", 1, True),
+    ],
+)
 def test_a_write_that_torch_does_not_count_is_seen(how: str, size: int, learned: bool) -> None:
-    """Of a tensor of more than 64 kB (200 x 200) where it changes more than single numbers."""
-    if size == 200 and "entry" in how:
-        pytest.skip("64 numbers of it are compared")
+    """Of a tensor of more than 64 kB (200 x 200) where it changes more than 64 numbers."""
     held = nn.Parameter(torch.rand(size, size, dtype=torch.float64), requires_grad=learned)
     policy, x = ReadsMatrix(held), torch.rand(3, 2, dtype=torch.float64)
     ready(policy, x)
@@ -380,16 +384,6 @@ def test_a_method_that_a_user_replaces_in_his_own_class_is_seen() -> None:
             right(of(kept, module), module)
 
 
-def test_a_function_of_rows_is_compiled_again_where_a_global_has_changed(notebook: Any) -> None:
-    module = Held(notebook.outer)
-    row = CompiledMethod(module.forward, module, compiled("a test"))
-    row.hasten()
-    for gain in (2.0, 5.0):
-        notebook.gain = gain
-        torch.testing.assert_close(row(X), module(X), rtol=1e-14, atol=0)
-    assert row.compiled
-
-
 def test_a_plant_that_reads_a_global_moves_by_its_number_of_the_moment(notebook: Any) -> None:
     class Plant(nn.Module):
         dim = 2
@@ -442,10 +436,8 @@ def generator() -> Iterator[float]:
 UNWRITTEN = (
     Refusing,
     deep,
-    itertools.count,
     threading.Lock,
     generator,
-    lambda: ctypes.pointer(ctypes.c_double()),
 )
 
 
@@ -500,7 +492,7 @@ def test_what_cannot_be_watched_is_said_once_and_taken_as_it_stands(caplog: pyte
     assert "are not noticed: an array of 800000 bytes" in line
 
 
-@pytest.mark.parametrize("shape", [(2,), (1, 2), (5, 2), (3, 4, 2), (2, 1, 3, 2), (0, 2)])
+@pytest.mark.parametrize("shape", [(2,), (5, 2), (2, 1, 3, 2), (0, 2)])
 def test_a_function_of_rows_takes_states_of_any_leading_dimensions(shape: tuple[int, ...]) -> None:
     x = torch.randn(shape, dtype=torch.float64)
     for _ in range(2):

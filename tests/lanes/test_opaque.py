@@ -26,16 +26,13 @@ class Damping(nn.Module):
 PLANT, COST = systems.Pendulum(), adp.QuadraticCost(1.0, 0.1, dim=2, inputs=1)
 X0 = tensor([[0.5, 0.1], [0.2, -0.3]])
 BASIS = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(st.rings(3), radius=0.1))
-STATES = systems.simulate(systems.Oscillator(), X0, dt=0.01, steps=60)
+STATES = systems.simulate(systems.Oscillator(), X0, dt=0.01, steps=3)
 POLICY, REGRESSOR = Damping(tensor(2.0)), st.StaFRegressor().fit(uniform(20, 2), uniform(20))
 
 
 def everything(x: Tensor) -> tuple[Tensor, ...]:
-    law = st.optim.SteepestDescent()
-    run = adp.simulate(POLICY, PLANT, COST, x, dt=0.02, steps=20, compile=False)
-    weights = st.chase_weights(STATES + x[:, None], BASIS, st.targets.Paper(), law).weights
-    value = st.chase(STATES, BASIS, st.targets.Paper(), law).value
-    return 2 * run.cost, weights + 1, value * 2, 2 * POLICY(x), REGRESSOR.predict(x[0]) + x
+    run = adp.simulate(POLICY, PLANT, COST, x, dt=0.02, steps=5, compile=False)
+    return 2 * run.cost, 2 * POLICY(x), REGRESSOR.predict(x[0]) + x
 
 
 def test_torch_compile_leaves_what_compiles_itself_alone() -> None:
@@ -48,7 +45,7 @@ def test_torch_compile_leaves_what_compiles_itself_alone() -> None:
 
     torch.compiler.reset()
     found = torch.compile(everything, backend=counted)(X0)
-    assert len(graphs) <= 6
+    assert len(graphs) <= 4
     assert all(torch.equal(*pair) for pair in zip(found, everything(X0), strict=True))
 
 
@@ -87,8 +84,8 @@ class Traced(nn.Module):
         self.program = lanes.Program(lambda x, now, row: (x.sin(), x))
 
     def forward(self, x: Tensor) -> tuple[Tensor, ...]:
-        chased = st.chase(STATES + x[:, None], BASIS, st.targets.Paper(), st.optim.Exact())
-        moved = systems.simulate(PLANT, x, dt=0.02, steps=12)
+        chased = st.chase(STATES + x[:, None], BASIS, st.targets.Paper(), st.optim.Exact(), inner_steps=1)
+        moved = systems.simulate(PLANT, x, dt=0.02, steps=3)
         return self.program(x, steps=3)[0], chased.value, moved, POLICY(x)
 
 

@@ -23,8 +23,6 @@ from staf_torch.lanes.trace.tracer import NotLoweredError
 pytestmark = pytest.mark.needs_compiler
 
 X = torch.linspace(-1, 1, 10, dtype=torch.float64).view(5, 2)
-COUNT = itertools.count()
-DRAW = np.random.default_rng(0)
 
 
 def mean(x: Tensor) -> Tensor:
@@ -45,13 +43,10 @@ def of_the_clock(x: Tensor) -> Tensor:
 
 OTHERS: dict[str, tuple[Callable[[Tensor], Tensor], str]] = {
     "torch": (lambda x: x + torch.randn(x.shape), "draws random numbers"),
-    "torch, like": (lambda x: x + torch.rand_like(x), "draws random numbers"),
     "torch, in place": (lambda x: x + torch.empty_like(x).normal_(), "draws random numbers"),
     "dropout": (lambda x: torch.nn.functional.dropout(x), "draws random numbers"),
     "NumPy": (lambda x: x + np.random.randn(), "called again"),  # noqa: NPY002
-    "a generator": (lambda x: x + DRAW.normal(), "called again"),
     "Python": (lambda x: x + random.random(), "called again"),
-    "a counter": (lambda x: x * (1 + next(COUNT)), "called again"),
     "a clock": (of_the_clock, "called again"),
     "a mean over the batch": (mean, "beside another row"),
     "the size of the batch": (of_the_size, "beside another row"),
@@ -68,14 +63,6 @@ def test_what_is_no_function_of_a_row_is_not_compiled(name: str, caplog: pytest.
     (line,) = caplog.messages
     assert line.startswith(f"{name}, refused runs in plain torch, slower: ")
     assert reason in line
-
-
-@pytest.mark.parametrize("name", ["torch", "NumPy", "Python", "a generator"])
-def test_noise_is_drawn_at_every_time(name: str) -> None:
-    function, _ = OTHERS[name]
-    _, found = Program(lambda x, _, __: (x, function(x)))(X, steps=50)
-    noise = (found - X[:, None]).flatten(1)
-    assert len(noise.unique()) >= 50
 
 
 def test_to_compile_draws_no_random_number() -> None:
@@ -227,8 +214,7 @@ def mixed_by(share: float, row: int) -> Step:
     return step
 
 
-@pytest.mark.parametrize("row", [0, 1])
-@pytest.mark.parametrize(("share", "compiles"), [(0.0, True), (0.009, True), (0.011, False), (0.5, False)])
+@pytest.mark.parametrize(("row", "share", "compiles"), [(0, 0.009, True), (0, 0.011, False), (1, 0.5, False)])
 def test_a_row_that_another_changes_by_a_hundredth_gives_a_step_away(
     row: int, share: float, compiles: bool
 ) -> None:
@@ -266,13 +252,8 @@ def test_other_results_among_others_are_found_out() -> None:
 A = torch.tensor([1.0, 2.0], dtype=torch.float64)
 REFUSED: dict[str, tuple[Callable[[Tensor], Any], str]] = {
     "a value of a row": (lambda x: x if bool(x.sum() > 0) else -x, "reads a value of a row"),
-    "a value, what to write": (lambda x: x * x[0, 0].item(), "; write `torch.where(condition, a, b)`"),
-    "a mask": (lambda x: x.masked_scatter(x > 0, x), "; write `y = torch.where(mask, new, y)`"),
+    "what to write": (lambda x: x * x[0, 0].item(), "; write `torch.where(condition, a, b)`"),
     "entries of a mask": (lambda x: x[x > 0], "at a mask that the row computes"),
-    "a least square": (
-        lambda x: torch.linalg.lstsq(x.unsqueeze(-1), x.unsqueeze(-1)).solution,
-        "write `torch.linalg.solve(A.mT @ A",
-    ),
     "singular values": (
         lambda x: torch.linalg.svdvals(x.unsqueeze(-1)),
         "write `torch.linalg.eigh(A.mT @ A)`",
@@ -280,25 +261,14 @@ REFUSED: dict[str, tuple[Callable[[Tensor], Any], str]] = {
     "half": (lambda x: x.half(), "compute in float32 or float64"),
     "an index of a row": (lambda x: x.nonzero(), "reads a value of a row"),
     "NumPy": (lambda x: torch.as_tensor(x.numpy()), "`Tensor.numpy` takes numbers of a row out of torch"),
-    "a list": (lambda x: x + x.tolist()[0][0], "`Tensor.tolist` takes numbers of a row out of torch"),
     "another dtype": (lambda x: x.to(torch.complex128), "is not supported in compiled programs"),
     "bits": (lambda x: x.long() & 1, "logic on the bits of integers"),
-    "random": (lambda x: x + torch.rand(2), "draws random numbers"),
     "no rows": (lambda x: x.sum(), "an output of the step has no dimension of rows"),
-    "more rows": (lambda x: torch.cat((x, x)), "an output of the step has no dimension of rows"),
     "an error": (lambda x: x[:, 7], "IndexError"),
     "an unknown": (lambda x: torch.special.i0(x), "i0"),
-    "a scatter that reduces": (
-        lambda x: x.scatter_reduce(1, x.argsort(), x, reduce="amax"),
-        "scatter_reduce",
-    ),
     "a scatter that multiplies": (
         lambda x: x.scatter(1, x.argsort(), x, reduce="multiply"),
         "`scatter` with reduce=",
-    ),
-    "added at an index of a row": (
-        lambda x: x.index_put((torch.tensor([0]), x.argmax(-1)), x[:, 0], accumulate=True),
-        "`aten.index_put` at an index that the row computes",
     ),
     "written at an index that was captured": (
         lambda x: x.index_put((torch.tensor([0]), A.argsort()[:1]), x[:, 0]),
@@ -318,7 +288,7 @@ def test_an_operation_without_a_scalar_form_is_named_with_its_line(name: str) ->
     with pytest.raises(NotLoweredError) as error:
         program.text(X[:, 0], (), X, steps=1)
     assert why in str(error.value)
-    assert name in ("no rows", "more rows") or f"{__name__.rpartition('.')[2]}.py" in str(error.value)
+    assert name == "no rows" or f"{__name__.rpartition('.')[2]}.py" in str(error.value)
 
 
 def test_a_carry_keeps_its_shapes_its_kinds_and_its_tree() -> None:

@@ -26,28 +26,6 @@ class Terminal(io.StringIO):
         return True
 
 
-def long_call() -> None:
-    """Four rounds: the first compiles, and says nothing of the time that the others take."""
-    with Sign("a value", 4, "rounds") as sign:
-        time.sleep(0.2)
-        sign.advance()
-        sign.advance()
-        with Sign("compiling 3 lines"):
-            time.sleep(WAIT)
-
-
-def test_a_log_that_takes_it_has_the_line_and_one_that_takes_nothing_none(
-    capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
-) -> None:
-    with caplog.at_level(logging.INFO, "staf_torch"):
-        long_call()
-    (line,) = caplog.messages
-    assert line.startswith("a value: 50 %")
-    with caplog.at_level(logging.ERROR, "staf_torch"):
-        long_call()
-    assert capsys.readouterr() == ("", "")
-
-
 def test_a_terminal_has_a_bar_under_the_log_that_is_wiped_in_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
     shown = Terminal()
     monkeypatch.setattr(sys, "stderr", shown)
