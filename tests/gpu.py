@@ -34,7 +34,18 @@ os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 import torch
 from torch import Tensor
 
-from staf_torch import lanes
+from staf_torch import (
+    ExperienceMemory,
+    GaussianKernel,
+    StaFBasis,
+    StaFRegressor,
+    StateFollowingCenters,
+    adp,
+    lanes,
+    rings,
+    systems,
+    targets,
+)
 from tests import gpu_cases as cases
 from tests import gpu_peers as peers
 from tests.registers import ptxas
@@ -96,8 +107,7 @@ def on_cpu(call: Callable[[str], Any]) -> Any:
         return call("cpu")
 
 
-def moved(tree: Any, device: str) -> Any:
-    return lanes.tree.moved(tree, device)
+moved = lanes.tree.moved
 
 
 def first(tree: Any, rows: int) -> Any:
@@ -335,8 +345,6 @@ def in_a_graph() -> bool:
 
 def simulated_in_a_graph() -> bool:
     """Whether `systems.simulate` is recorded, too, and marks the rows that need shorter steps."""
-    from staf_torch import systems
-
     plant, away = systems.VanDerPol().to(DEVICE), 0.0
     x = torch.linspace(-1, 1, 2000, dtype=torch.float64, device=DEVICE).reshape(1000, 2)
     for _ in range(4):
@@ -396,18 +404,6 @@ def nothing_waits() -> bool:
 
 def doors() -> dict[str, Callable[[], Any]]:
     """Functions of the library on tensors of the device, which give the same there as on the CPU."""
-    from staf_torch import (
-        ExperienceMemory,
-        GaussianKernel,
-        StaFBasis,
-        StaFRegressor,
-        StateFollowingCenters,
-        adp,
-        rings,
-        systems,
-        targets,
-    )
-
     plant, cost = systems.TwoState(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
 
     def x0(device: str, rows: int = 64) -> Tensor:
@@ -488,7 +484,7 @@ def programs(only: str) -> Iterator[tuple[str, torch.dtype, Callable[[], Any]]]:
             yield name, torch.float64, call
 
 
-def registers(only: str, architectures: tuple[int, ...]) -> int:
+def registers(only: str) -> int:
     """Compile the kernels with nvcc for several architectures; print their registers and what is spilled."""
     bad, seen = 0, set[str]()
     for name, dtype, call in programs(only):
@@ -496,7 +492,7 @@ def registers(only: str, architectures: tuple[int, ...]) -> int:
             call()
         for text in [text for text in texts if name in KINDS or text not in seen]:
             seen.add(text)
-            found = ptxas(text, architectures)
+            found = ptxas(text, (80, 90, 100))
             spilling = any(each.spilled for each in found.values())
             why = SPILLING.get(name, "") if spilling else ""
             bad |= int(spilling and not why)
@@ -513,41 +509,29 @@ def main() -> int:
     global DEVICE
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     options.add_argument("--ptxas", action="store_true")
-    options.add_argument("--architectures", default="80,90,100", help="of --ptxas")
     options.add_argument("--host", action="store_true", help="the host as a device, few rows")
     options.add_argument("--only", default="")
-    options.add_argument("--largest", type=int, default=10**9, help="rows")
-    options.add_argument("--no-peers", action="store_true")
-    options.add_argument("--seconds", type=float, default=170.0, help="after which nothing more is begun")
     given = options.parse_args()
     if given.ptxas:
-        return registers(given.only, tuple(map(int, given.architectures.split(","))))
+        return registers(given.only)
     if given.host:
         DEVICE = "cpu"
         with lanes.device.host():
-            return int(
-                not all(
-                    [
-                        *table([name for name in KINDS if given.only in name], min(given.largest, 1000)),
-                        *checked(()),
-                    ]
-                )
-            )
+            names = [name for name in KINDS if given.only in name]
+            return int(not all([*table(names, 1000), *checked(())]))
     if not torch.cuda.is_available():
         print("no CUDA device here")
         return 2
-    return on_card(given)
+    return on_card(given.only)
 
 
-def on_card(given: argparse.Namespace) -> int:
+def on_card(only: str) -> int:
     """Build everything ahead, in as many processes as there are cores, and print the tables."""
     begin = time.perf_counter()
-    until = begin + given.seconds
+    until = begin + SECONDS
     warnings.simplefilter("ignore")  # of the profiler
-    names = [name for name in KINDS if given.only in name and (given.only or name not in LONG)]
-    wanted = [
-        (name, dtype) for name in sorted(names, key=lambda name: "M = 15" not in name) for dtype in DTYPES
-    ]
+    names = [name for name in KINDS if only in name and (only or name not in LONG)]
+    wanted = list(itertools.product(sorted(names, key=lambda name: "M = 15" not in name), DTYPES))
     workers = min(len(wanted), max(1, (os.cpu_count() or 1) - 2))
     spawn = multiprocessing.get_context("spawn")
     rival: dict[Any, Any] = {}
@@ -555,10 +539,10 @@ def on_card(given: argparse.Namespace) -> int:
         concurrent.futures.ThreadPoolExecutor(8) as threads,
         concurrent.futures.ProcessPoolExecutor(workers, mp_context=spawn) as pool,
     ):
-        tried = [] if given.only else [threads.submit(experiment, name) for name in EXPERIMENTS]
+        tried = [] if only else [threads.submit(experiment, name) for name in EXPERIMENTS]
         waiting = {what: pool.submit(build, *what) for what in wanted}
-        if not given.no_peers and not given.only:
-            rival = peers.built(threads, given.largest)
+        if not only:
+            rival = peers.built(threads)
         for what, each in waiting.items():
             failed, held, seconds = each.result()
             TRUTHS.update({what: held} if held else {})
@@ -571,14 +555,9 @@ def on_card(given: argparse.Namespace) -> int:
         concurrent.futures.wait(rival.values())
     built = time.perf_counter() - begin
     print(f"{torch.cuda.get_device_name()}, torch {torch.__version__}; built in {built:.0f} s", flush=True)
-    RIGHT.extend(table(names, given.largest, until))
+    RIGHT.extend(table(names, until=until))
     RIGHT.extend(checked())
     peers.compared(rival, RATES, until)
-    if not given.no_peers:
-        laws = sorted(
-            (name for name in names if name.startswith("M =")), key=lambda name: "M = 15" not in name
-        )
-        peers.eager(laws, lambda *what: made(*what), RATES, DEVICE, until)
     print(f"{time.perf_counter() - begin:.0f} s in all; {'all right' if all(RIGHT) else 'WRONG'}")
     return int(not all(RIGHT))
 
@@ -586,10 +565,11 @@ def on_card(given: argparse.Namespace) -> int:
 LONG = ("M = 15 RecursiveLeastSquares",)
 """Kinds for `--only`: ten seconds a call, of matrices that do not fit into a thread's registers."""
 SLOW = 20  # seconds of building that are told
+SECONDS = 170.0  # after which nothing more is begun
 RIGHT: list[bool] = []
 
 
-def table(names: Sequence[str], largest: int, until: float = float("inf")) -> Iterator[bool]:
+def table(names: Sequence[str], largest: int = 10**9, until: float = float("inf")) -> Iterator[bool]:
     """Print the table, as far as it comes in time; whether each line is right."""
     rates = f"{'call ms':>9} kernel ms {'G/s':>8} {'kernel':>8} other kernels"
     print(f"{'program':28} {'dtype':8} {'rows':>8} {'error':>8} {'bound':>8} first s {rates}")

@@ -1,6 +1,6 @@
 """What the closed loops are claimed to reach, measured in full: 200 seeds, 200 initial states, 10 s.
 
-    python tests/benchmarks/adp_claims.py [--json FILE]
+    python tests/benchmarks/adp_claims.py
 
 The suite tests the same on shorter runs and fewer rows; the experiments adp_three_state, adp_comparison and
 adp_initial_weights measure the rest. Takes some minutes. Not collected by pytest.
@@ -8,11 +8,8 @@ adp_initial_weights measure the rest. Takes some minutes. Not collected by pytes
 
 from __future__ import annotations
 
-import argparse
-import json
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -122,18 +119,11 @@ CLAIMS: dict[str, Callable[[], dict[str, float]]] = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", type=Path, help="write the results here as well")
-    options = parser.parse_args()
-    results = {}
     for name, claim in CLAIMS.items():
         start = time.perf_counter()
         with torch.no_grad():
-            results[name] = claim()
-        numbers = ", ".join(f"{key} {value:.6g}" for key, value in results[name].items())
+            numbers = ", ".join(f"{key} {value:.6g}" for key, value in claim().items())
         print(f"{name} ({time.perf_counter() - start:.0f} s)\n    {numbers}", flush=True)
-    if options.json:
-        options.json.write_text(json.dumps(results, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 import casadi
 import numpy as np
 import torch
+from timing import spent
 from torch import Tensor
 
 from staf_torch import adp, systems
@@ -158,7 +159,8 @@ def among(kind: str, count: int, seed: int) -> Loop:
     cost = avoidance.vehicle_cost(cfg, own, int(plant.dim or 0))
     n, free = own.size, adp.QuadraticCost(1.0, 1.0, dim=4, inputs=2)
     if kind == "mass":
-        value = adp.SampledProblem.of(systems.Linear(*_plane()), free, dt=DT).p
+        plane = (np.kron(part, np.eye(2)).tolist() for part in ([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]]))
+        value = adp.SampledProblem.of(systems.Linear(*plane), free, dt=DT).p
         rival = Predictive(mass(value.numpy()), own.bounds)
 
         def end(x: Tensor) -> Tensor:
@@ -176,35 +178,14 @@ def among(kind: str, count: int, seed: int) -> Loop:
     walls = [avoidance.apart(own, k, RADIUS) for k in range(DISCS)]
     bounds = {"low": [-bound for bound in own.bounds], "high": list(own.bounds)}
     behind = {"dt": DT, "decay": 3.0, "margin": 1e-3, **bounds}
-    detours = adp.DetourRollout(
-        wanted,
-        plant,
-        cost,
-        walls,
-        axes=torch.eye(2, plant.dim),
-        dt=DT,
-        steps=AHEAD,
-        stride=2,
-        terminal=end,
-        margin=0.04,
-    )
+    looking = {"axes": torch.eye(2, plant.dim), "dt": DT, "steps": AHEAD, "stride": 2, "terminal": end}
+    detours = adp.DetourRollout(wanted, plant, cost, walls, margin=0.04, **looking)  # type: ignore[arg-type]
     # Of a unicycle: what the rival keeps outside.
     parts = dict(zip(type(own).__match_args__, own, strict=True))
     center = type(own)(**(parts | {"point": lambda x: x[..., :2], "reach": 0.0}))
     near = [avoidance.apart(center, k, RADIUS) for k in range(DISCS)]
     # What a vehicle cuts of a disc between samples at 1.5 m/s of each other is 7 mm.
-    ways = adp.DetourRollout(
-        wanted,
-        plant,
-        cost,
-        near,
-        axes=torch.eye(2, plant.dim),
-        dt=DT,
-        steps=AHEAD,
-        stride=2,
-        terminal=end,
-        margin=0.02,
-    )
+    ways = adp.DetourRollout(wanted, plant, cost, near, margin=0.02, **looking)  # type: ignore[arg-type]
     plans = adp.DetourPlans(ways, moved=n)
     # Plans keep their distance themselves: the filter asks a unicycle for 2 mm at the next sample alone.
     last = {"dt": DT, "margin": 2e-3, "degree": 1, "decay": 60.0, **bounds}
@@ -218,64 +199,51 @@ def among(kind: str, count: int, seed: int) -> Loop:
     return Loop(plant, cost, x0, ours, rival)
 
 
-def _plane() -> tuple[list[list[float]], list[list[float]]]:
-    """A and B of the mass."""
-    a, b = np.kron([[0.0, 1.0], [0.0, 0.0]], np.eye(2)), np.kron([[0.0], [1.0]], np.eye(2))
-    return a.tolist(), b.tolist()
-
-
 def main(count: int, rivals: int, kind: str, seed: int) -> None:
     torch.set_num_threads(1)
     loop = among(kind, count, seed)
-    settings = {"dt": DT, "steps": STEPS}
     n = loop.rival.size
     costs: dict[str, Tensor] = {}
 
-    def told(name: str, run: adp.LoopResult) -> None:
-        discs = run.state[..., n:].unflatten(-1, (-1, 4))[..., :2]
-        gaps = (run.state[..., None, :2] - discs).norm(dim=-1).amin((1, 2)) - RADIUS
+    def told(name: str, found: adp.LoopResult) -> None:
+        discs = found.state[..., n:].unflatten(-1, (-1, 4))[..., :2]
+        gaps = (found.state[..., None, :2] - discs).norm(dim=-1).amin((1, 2)) - RADIUS
         deep = int((gaps < -_TOUCH).sum())
-        costs[name] = run.cost
-        print(f"{name}: cost {float(run.cost.mean()):.3f}, collisions {deep} of {len(gaps)}, ", end="")
+        costs[name] = found.cost
+        print(f"{name}: cost {float(found.cost.mean()):.3f}, collisions {deep} of {len(gaps)}, ", end="")
         print(f"least distance {float(gaps.min()):.5f} m", flush=True)
+
+    def run(controller: adp.Controller, x0: Tensor) -> adp.LoopResult:
+        compiled = controller is not loop.rival
+        return adp.simulate(controller, loop.plant, loop.cost, x0, dt=DT, steps=STEPS, compile=compiled)
 
     def seconds(controller: adp.Controller, x0: Tensor) -> float:
         """A control in a loop in one program, plant included, less what begins it: each the least of some."""
-        loops, before = list[float](), list[float]()
-        for _ in range(1 if len(x0) > 1 else ROUNDS):
-            clock = time.process_time()
-            adp.simulate(controller, loop.plant, loop.cost, x0, compile=True, **settings)  # type: ignore[arg-type]
-            loops.append(time.process_time() - clock)
-            controller.init(x0)
-            before.append(time.process_time() - clock - loops[-1])
-        begun[len(x0)] = min(before) / len(x0)
-        return (min(loops) - min(before)) / len(x0) / STEPS
+        rounds = range(1 if len(x0) > 1 else ROUNDS)
+        before = min(spent(lambda: controller.init(x0))[0] for _ in rounds)
+        begun[len(x0)] = before / len(x0)
+        return (min(spent(lambda: run(controller, x0))[0] for _ in rounds) - before) / len(x0) / STEPS
 
-    spent = {}
+    times = {}
     begun: dict[int, float] = {}
     for name, controller in loop.ours.items():
-        told(name, adp.simulate(controller, loop.plant, loop.cost, loop.x0, compile=True, **settings))  # type: ignore[arg-type]
+        told(name, run(controller, loop.x0))
         alone = [seconds(controller, row[None]) for row in loop.x0[:ALONE]]
-        spent[name] = sum(alone) / len(alone), max(alone), seconds(controller, loop.x0)
+        times[name] = sum(alone) / len(alone), max(alone), seconds(controller, loop.x0)
         print(
             f"  before the loop {1e3 * begun[1]:.2f} ms alone, {1e3 * begun[len(loop.x0)]:.2f} a row of many"
         )
-    run = adp.simulate(loop.rival, loop.plant, loop.cost, loop.x0[:rivals], compile=False, **settings)  # type: ignore[arg-type]
-    told("NMPC by IPOPT", run)
+    told("NMPC by IPOPT", run(loop.rival, loop.x0[:rivals]))
     theirs = loop.rival.seconds / loop.rival.asked
     print(f"NMPC: {1e6 * theirs:.0f} us a control, {loop.rival.failed} of {loop.rival.asked} not solved")
-    for name, (mean, most, many) in spent.items():
+    for name, (mean, most, many) in times.items():
         print(f"{name}: a control {1e6 * mean:.1f} us alone ({theirs / mean:.0f} times less), ")
         print(f"  slowest of {ALONE} loops {1e6 * most:.1f}; {1e6 * many:.2f} us a row ({theirs / many:.0f})")
         mine = costs[name][:rivals]
         ratio = mine / costs["NMPC by IPOPT"]
-        parts = {
-            "of the means": mine.mean() / costs["NMPC by IPOPT"].mean(),
-            "median": ratio.median(),
-            "largest": ratio.max(),
-            "least": ratio.min(),
-        }
-        print("  over NMPC's cost: " + ", ".join(f"{key} {float(value):.4f}" for key, value in parts.items()))
+        means = float(mine.mean() / costs["NMPC by IPOPT"].mean())
+        print(f"  over NMPC's cost: of the means {means:.4f}, median {float(ratio.median()):.4f}, ", end="")
+        print(f"largest {float(ratio.max()):.4f}")
         print(f"  at most 1.05 of it in {int((ratio <= 1.05).sum())} of {rivals}", flush=True)
 
 

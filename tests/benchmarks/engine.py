@@ -3,31 +3,24 @@
 States given, ten iterations, the weights of every time returned; exponential kernel, the paper's V, rings.
 The rounds of all programs of a row alternate; a speed is the best of the rounds, in CPU seconds of this
 process, so that other programs on the machine matter little. The benchmark refuses a chase that was not
-compiled. Peers that are not installed are skipped by name. Writes runs/benchmarks/engine.json.
+compiled. Peers that are not installed are skipped by name.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import logging
 import resource
-import sys
-import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+import peer_laws
 import torch
+from timing import spent
 
-ROOT = Path(__file__).parents[2]
-sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
-
-import peer_laws  # noqa: E402
-
-import staf_torch as st  # noqa: E402
-from staf_torch.engine import predictors  # noqa: E402
+import staf_torch as st
+from staf_torch.engine import predictors
 
 STEPS = 10
 LEAST_SECONDS, MOST_ROUNDS = 0.04, 200  # the system notes what other threads used some milliseconds late
@@ -66,10 +59,7 @@ def plain_value(x: torch.Tensor) -> torch.Tensor:
 
 def used(program: Callable[[], Any], calls: int) -> float:
     """CPU seconds of a call."""
-    start = time.process_time()
-    for _ in range(calls):
-        program()
-    return max(time.process_time() - start, 1e-9) / calls
+    return max(spent(program, calls)[0], 1e-9)
 
 
 def measured(programs: dict[str, Callable[[], Any]], steps: int, rounds: int) -> dict[str, float]:
@@ -81,16 +71,17 @@ def measured(programs: dict[str, Callable[[], Any]], steps: int, rounds: int) ->
         built = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before
         if built > 0.05:
             print(f"      {name}: compiled in {built:.1f} CPU s", flush=True)
-    spent = dict.fromkeys(programs, 0.0)
-    calls = {name: max(1, round(LEAST_SECONDS / used(program, 3))) for name, program in programs.items()}
+    total = dict.fromkeys(programs, 0.0)
+    calls = {
+        name: max(1, round(LEAST_SECONDS / max(spent(program, 3)[0], 1e-9)))
+        for name, program in programs.items()
+    }
     for _ in range(MOST_ROUNDS):
         for name, program in programs.items():
             seconds = used(program, calls[name])
-            best[name], spent[name] = (
-                min(best.get(name, np.inf), seconds),
-                spent[name] + seconds * calls[name],
-            )
-        if min(spent.values()) > rounds * LEAST_SECONDS:
+            best[name] = min(best.get(name, np.inf), seconds)
+            total[name] += seconds * calls[name]
+        if min(total.values()) > rounds * LEAST_SECONDS:
             break
     return {name: steps / seconds / 1e6 for name, seconds in best.items()}
 
@@ -143,22 +134,19 @@ def main() -> None:
     options = parser.parse_args()
     logging.getLogger("staf_torch").addHandler(Refuse())
     torch.set_num_threads(1)
-    rows: list[dict[str, Any]] = []
     for count in options.centers or ((3, 6) if options.quick else (3, 6, 15)):
         basis = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(st.rings(count), RADIUS[count]))
         for dtype in (torch.float64,) if options.quick else (torch.float64, torch.float32):
             for batch, times in WORK.items():
                 if options.rows in (None, batch):
                     x, names = states(batch, times, dtype), (*peer_laws.LAWS, *OTHERS, *PREDICTED)
-                    found = [row(n, basis, x, 4 if options.quick else 8) for n in names if options.only in n]
-                    rows += found
-    out = ROOT / "runs" / "benchmarks" / "engine.json"
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(json.dumps(rows, indent=1))
+                    for name in names:
+                        if options.only in name:
+                            row(name, basis, x, 4 if options.quick else 8)
 
 
-def row(name: str, basis: st.StaFBasis, x: torch.Tensor, rounds: int) -> dict[str, Any]:
-    """Measure one law at one size."""
+def row(name: str, basis: st.StaFBasis, x: torch.Tensor, rounds: int) -> None:
+    """Measure one law at one size; print a line."""
     predictor: st.engine.Predictor | None = None
     steps, (batch, times, _) = STEPS, x.shape
     if name in PREDICTED:
@@ -183,7 +171,6 @@ def row(name: str, basis: st.StaFBasis, x: torch.Tensor, rounds: int) -> dict[st
     text = ", ".join(f"{n} {v:.3g}" for n, v in found.items())
     size = f"M={basis.count} {str(x.dtype)[6:]} B={batch}"
     print(f"{size:24s} {name:30s} {text}; over JAX {found['ours'] / best:.2f}", flush=True)
-    return {"law": name, "M": basis.count, "dtype": str(x.dtype)[6:], "B": batch, **found}
 
 
 if __name__ == "__main__":

@@ -13,16 +13,13 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
+from timing import spent
 from torch import Tensor
 
 from staf_torch import (
-    AnchoredKernel,
-    ExponentialKernel,
     GaussianKernel,
     StaFBasis,
     StateFollowingCenters,
-    StateRadius,
-    adp,
     chase_weights,
     lanes,
     optim,
@@ -39,9 +36,7 @@ def least(function: Callable[[], Any], seconds: float = 4.0) -> float:
     function()
     best, end = float("inf"), time.perf_counter() + seconds
     while time.perf_counter() < end:
-        begin = time.process_time()
-        function()
-        best = min(best, time.process_time() - begin)
+        best = min(best, spent(function)[0])
     return 1e3 * best
 
 
@@ -81,47 +76,9 @@ def chased(count: int, times: int) -> tuple[Loss, list[Tensor]]:
     return lambda: chase_weights(states, basis, value, law, weights=first).weights.square().mean(), wanted
 
 
-def network() -> tuple[Loss, list[Tensor]]:
-    layers = [torch.nn.Linear(2, 32), torch.nn.Tanh(), torch.nn.Linear(32, 32), torch.nn.Tanh()]
-    net = torch.nn.Sequential(*layers, torch.nn.Linear(32, 1)).double()
-    states = systems.simulate(systems.Oscillator(), torch.randn(1000, 2, dtype=F64), dt=0.01, steps=199)
-    basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(3), radius=0.3))
-    law = optim.SteepestDescent()
-
-    def value(x: Tensor) -> Tensor:
-        found: Tensor = net(x).squeeze(-1)
-        return found
-
-    return lambda: chase_weights(states, basis, value, law).weights.square().mean(), list(net.parameters())
-
-
-def learner() -> tuple[Loss, list[Tensor]]:
-    plant, cost = systems.TwoState(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
-    centers = StateFollowingCenters(rings(3), StateRadius(0.7, 1e-5))
-    basis = adp.StaFValueBasis(StaFBasis(AnchoredKernel(ExponentialKernel()), centers)).double()
-    points = adp.RandomPoints(1, StateRadius(2.1, 1e-5))
-    x0 = torch.tensor([-1.0, 1.0], dtype=F64) + 0.1 * torch.randn(1000, 2, dtype=F64)
-    gain = torch.tensor(1.2, dtype=F64).requires_grad_()
-    critic = torch.tensor(0.4, dtype=F64).requires_grad_()
-
-    def loss() -> Tensor:
-        law = adp.Information(adp.Gains(actor=gain))
-        actor_critic = adp.ActorCritic(basis, plant, cost, points, law, critic=critic.expand(3))
-        found: Tensor = adp.simulate(
-            actor_critic, plant, cost, x0, dt=0.001, steps=2000, compile=True
-        ).cost.mean()
-        return found
-
-    return loss, [gain, critic]
-
-
 CASES: dict[str, Callable[[], tuple[Loss, list[Tensor]]]] = {
     "lorenz": lorenz,
     "chase3": lambda: chased(3, 100),
-    "chase6": lambda: chased(6, 100),
-    "chase15": lambda: chased(15, 100),
-    "network": network,
-    "learner": learner,
 }
 
 
@@ -173,9 +130,7 @@ def main() -> None:
 
         with torch.no_grad():
             forward = least(loss)
-        begin = time.process_time()
-        both()
-        first = time.process_time() - begin
+        first = spent(both)[0]
         together = least(both)
         ratio = f"ratio {together / forward:.2f}; first {first:.1f} s"
         print(f"{name:8} forward {forward:8.2f} ms, with gradient {together:8.2f} ms, {ratio}")

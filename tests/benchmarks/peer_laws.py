@@ -124,11 +124,11 @@ def jax_programs(law: str, offsets: np.ndarray, inner_steps: int) -> dict[str, t
     return {"jit(vmap(scan))": (jax.jit(jax.vmap(scanned)), False), "batch last": (jax.jit(stacked), True)}
 
 
-def jax_apart(law: str, offsets: np.ndarray, inner_steps: int) -> Program:
+def jax_apart(offsets: np.ndarray, inner_steps: int) -> Program:
     """A scan with every component an array (B,) of its own, all iterations written out: (T, n, B) states.
 
-    Steepest descent and conjugate gradient; returns M arrays (T, B). What XLA makes of it is one kernel or
-    two a time, its numbers in registers.
+    Steepest descent; returns M arrays (T, B). What XLA makes of it is one kernel or two a time, its numbers
+    in registers.
     """
     import jax
     import jax.numpy as jnp
@@ -153,24 +153,14 @@ def jax_apart(law: str, offsets: np.ndarray, inner_steps: int) -> Program:
             scaled = [s * each for s, each in zip(scale, u, strict=True)]
             return [s * dot(row, scaled) for s, row in zip(scale, core, strict=True)]
 
-        def slope_at(a: Any) -> Any:
-            return [2 * (v - k) for v, k in zip(values, product(a), strict=True)]
-
         unit = jnp.exp(gain - last)
         a = [each * unit for each in a]
-        g, p, before = slope_at(a), [jnp.zeros_like(x)] * len(a), jnp.zeros_like(x)
+        g = [2 * (v - k) for v, k in zip(values, product(a), strict=True)]
         for _ in range(inner_steps):
-            if law == "SteepestDescent":
-                image = product(g)
-                twice = ratio(dot(g, g), dot(g, image))
-                a = [each + 0.5 * twice * down for each, down in zip(a, g, strict=True)]
-                g = [down - twice * each for down, each in zip(g, image, strict=True)]
-                continue
-            g = slope_at(a)
-            slope = dot(g, g)
-            p = [down + ratio(slope, before) * each for down, each in zip(g, p, strict=True)]
-            length = 0.5 * ratio(dot(g, p), dot(p, product(p)))
-            a, before = [each + length * along for each, along in zip(a, p, strict=True)], slope
+            image = product(g)
+            twice = ratio(dot(g, g), dot(g, image))
+            a = [each + 0.5 * twice * down for each, down in zip(a, g, strict=True)]
+            g = [down - twice * each for down, each in zip(g, image, strict=True)]
         weight = jnp.exp(-gain)
         return (tuple(a), gain), tuple(each * weight for each in a)
 

@@ -10,22 +10,18 @@ steps, and the table has the time of all. A peer that is not installed is named 
 from __future__ import annotations
 
 import argparse
-import resource
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from timing import in_turn
 
-ROOT = Path(__file__).parents[2]
-sys.path[:0] = [str(ROOT)]
-
-from staf_torch import lanes  # noqa: E402
+from staf_torch import lanes
 
 DT, STEPS, ROUNDS = 0.01, 1000, 3
 MAPPED = 1000  # rows of a CasADi map
@@ -37,25 +33,25 @@ def rate(x: torch.Tensor, damping: torch.Tensor) -> torch.Tensor:
     return torch.stack((x[:, 1], -x[:, 0].sin() - damping * x[:, 1] - 0.1 * x[:, 1] * x[:, 1].abs()), dim=-1)
 
 
-def runge_kutta(x: torch.Tensor, damping: torch.Tensor) -> torch.Tensor:
-    """One step."""
-    k1 = rate(x, damping)
-    k2 = rate(x + DT / 2 * k1, damping)
-    k3 = rate(x + DT / 2 * k2, damping)
-    k4 = rate(x + DT * k3, damping)
+def runge_kutta(field: Callable[[Any, Any], Any], x: Any, damping: Any) -> Any:
+    """One step, of torch, JAX or CasADi."""
+    k1 = field(x, damping)
+    k2 = field(x + DT / 2 * k1, damping)
+    k3 = field(x + DT / 2 * k2, damping)
+    k4 = field(x + DT * k3, damping)
     return x + DT / 6 * (k1 + 2 * (k2 + k3) + k4)
 
 
 def ours(x0: torch.Tensor, damping: torch.Tensor) -> Callable[[], np.ndarray]:
     """The step as a program of lanes."""
-    program = lanes.Program(lambda x, _, row: (runge_kutta(x, row), ()))
+    program = lanes.Program(lambda x, _, row: (runge_kutta(rate, x, row), ()))
     assert program.compiles(x0, (), damping, steps=STEPS)
     return lambda: program(x0, (), damping, steps=STEPS)[0].numpy()
 
 
 def compiled(x0: torch.Tensor, damping: torch.Tensor) -> Callable[[], np.ndarray]:
     """The step by torch.compile, called from Python; SOME steps."""
-    step = torch.compile(runge_kutta)
+    step = torch.compile(lambda x, damping: runge_kutta(rate, x, damping))
 
     def run() -> np.ndarray:
         x = x0
@@ -77,14 +73,7 @@ def with_jax(x0: np.ndarray, damping: np.ndarray, last: bool) -> Callable[[], np
         return jnp.stack((x[1], -jnp.sin(x[0]) - c * x[1] - 0.1 * x[1] * jnp.abs(x[1])))
 
     def trajectory(x: Any, c: Any) -> Any:
-        def step(x: Any, _: Any) -> tuple[Any, None]:
-            k1 = field(x, c)
-            k2 = field(x + DT / 2 * k1, c)
-            k3 = field(x + DT / 2 * k2, c)
-            k4 = field(x + DT * k3, c)
-            return x + DT / 6 * (k1 + 2 * (k2 + k3) + k4), None
-
-        return jax.lax.scan(step, x, None, length=STEPS)[0]
+        return jax.lax.scan(lambda x, _: (runge_kutta(field, x, c), None), x, None, length=STEPS)[0]
 
     fast = jax.jit(trajectory if last else jax.vmap(trajectory))
     given = jax.device_put(np.ascontiguousarray(x0.T) if last else x0)
@@ -98,14 +87,10 @@ def with_casadi(x0: np.ndarray, damping: np.ndarray, folder: Path) -> Callable[[
 
     x, c = ca.SX.sym("x", 2), ca.SX.sym("c")
 
-    def field(x: Any) -> Any:
+    def field(x: Any, c: Any) -> Any:
         return ca.vertcat(x[1], -ca.sin(x[0]) - c * x[1] - 0.1 * x[1] * ca.fabs(x[1]))
 
-    k1 = field(x)
-    k2 = field(x + DT / 2 * k1)
-    k3 = field(x + DT / 2 * k2)
-    k4 = field(x + DT * k3)
-    step = ca.Function("step", [x, c], [x + DT / 6 * (k1 + 2 * (k2 + k3) + k4)])
+    step = ca.Function("step", [x, c], [runge_kutta(field, x, c)])
     start, fixed = ca.MX.sym("start", 2), ca.MX.sym("fixed")
     end = step.fold(STEPS)(start, ca.repmat(fixed, 1, STEPS))
     mapped = ca.Function("row", [start, fixed], [end]).map(MAPPED)
@@ -117,12 +102,6 @@ def with_casadi(x0: np.ndarray, damping: np.ndarray, folder: Path) -> Callable[[
     call = ca.external(mapped.name(), f"{folder}/mapped.so")
     states, rows = x0[:MAPPED].T, damping[None, :MAPPED]
     return lambda: np.asarray(call(states, rows)).T
-
-
-def cpu() -> float:
-    """CPU seconds of this process."""
-    used = resource.getrusage(resource.RUSAGE_SELF)
-    return used.ru_utime + used.ru_stime
 
 
 def main() -> None:
@@ -143,31 +122,21 @@ def main() -> None:
             ),
             "torch.compile of a step": (STEPS / SOME, lambda: compiled(x0, damping)),
         }
-        best: dict[str, float] = {}
         programs: dict[str, Callable[[], np.ndarray]] = {}
         wanted: np.ndarray | None = None
         for name, (_, make) in makers.items():
             try:
-                start = time.process_time()
                 programs[name] = make()
-                found = programs[name]()
-                print(
-                    f"{name}: ready after {time.process_time() - start:.1f} CPU s",
-                    file=sys.stderr,
-                    flush=True,
-                )
             except ImportError as error:
                 print(f"{name} is left out: {error}", file=sys.stderr)
                 continue
+            found = programs[name]()
             wanted = found if wanted is None else wanted
             if name != "torch.compile of a step":
                 found = found.T if found.shape[0] == 2 else found
                 np.testing.assert_allclose(found, wanted[: len(found)], rtol=1e-9, atol=1e-11)
-        for _ in range(ROUNDS):
-            for name, program in programs.items():
-                start = cpu()
-                program()
-                best[name] = min(best.get(name, np.inf), (cpu() - start) * makers[name][0])
+        times = in_turn(programs, ROUNDS)
+        best = {name: min(cpu for cpu, _ in each) * makers[name][0] for name, each in times.items()}
     print("| program | CPU s | us a row | ratio |\n|---|---|---|---|")
     for name, seconds in best.items():
         ratio = seconds / best["staf_torch.lanes"]

@@ -1,6 +1,6 @@
 """`adp.DirectShooting` beside IPOPT on the same discretisation: is what it calls converged the optimum?
 
-    python tests/benchmarks/shooting.py [--cases CASE,CASE] [--states 4] [--starts 6] [--seed 0] [--json FILE]
+    python tests/benchmarks/shooting.py [--cases CASE,CASE] [--states 4] [--starts 6] [--seed 0]
 
 Needs casadi. Every plant on which `experiments/rival_plants.py` compares methods, in continuous time, from
 random states of its box, and swing-ups from hanging and from random states; the mesh, the Runge-Kutta
@@ -15,12 +15,10 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import math
 import sys
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import casadi
@@ -68,51 +66,40 @@ _PENDULUM = RivalPlant(
 _CART = CASES["cart_pole_swing_up"]
 
 
-@dataclasses.dataclass(frozen=True)
-class Shot:
-    """A plant with the states to solve from.
-
-    Attributes:
-        first: states beside the random ones of the box.
-        draws: whether random ones are solved from.
-    """
-
-    case: RivalPlant
-    first: tuple[tuple[float, ...], ...] = ()
-    draws: bool = True
-    options: dict[str, Any] = dataclasses.field(default_factory=dict)
-
-
 _DOWN = ((0.0, math.pi, 0.0, 0.0),)
-SHOTS = {
-    "double integrator": Shot(CASES["double_integrator"], ((5.0, 0.0),)),
-    "two states and a third": Shot(
-        RivalPlant("three", three_states, 0.1, 1, ((1.0,) * 3, (1.0,)), (-9.0,), (9.0,), (1.0,) * 3)
+SHOTS: dict[str, tuple[RivalPlant, tuple[tuple[float, ...], ...]]] = {  # states beside random ones of the box
+    "double integrator": (CASES["double_integrator"], ((5.0, 0.0),)),
+    "two states and a third": (
+        RivalPlant("three", three_states, 0.1, 1, ((1.0,) * 3, (1.0,)), (-9.0,), (9.0,), (1.0,) * 3),
+        (),
     ),
-    "short period": Shot(
+    "short period": (
         RivalPlant(
             "short_period", short_period, 0.1, 1, ((0.25, 0.25), (5.0,)), (-2.0,), (2.0,), (25.0, 10.0)
         ),
         ((25.0, -10.0),),
     ),
-    "cart-pole free": Shot(dataclasses.replace(CASES["cart_pole_10N"], low=(-1e3,), high=(1e3,))),
-    "cart-pole 10 N": Shot(CASES["cart_pole_10N"]),
-    "cart-pole 5 N": Shot(CASES["cart_pole_5N"]),
-    "cart-pole to 1 m": Shot(CASES["cart_pole_to_1m"]),
-    "quadrotor": Shot(dataclasses.replace(CASES["quadrotor"], box=(0.8,) * 6)),
-    "pendulum up": Shot(_PENDULUM, ((math.pi, 0.0), (3.0, 0.0))),
-    "cart-pole up 10 N": Shot(_CART, _DOWN),
-    "cart-pole up 5 N": Shot(dataclasses.replace(_CART, low=(-5.0,), high=(5.0,)), _DOWN),
+    "cart-pole free": (dataclasses.replace(CASES["cart_pole_10N"], low=(-1e3,), high=(1e3,)), ()),
+    "cart-pole 10 N": (CASES["cart_pole_10N"], ()),
+    "cart-pole 5 N": (CASES["cart_pole_5N"], ()),
+    "cart-pole to 1 m": (CASES["cart_pole_to_1m"], ()),
+    "quadrotor": (dataclasses.replace(CASES["quadrotor"], box=(0.8,) * 6), ()),
+    "pendulum up": (_PENDULUM, ((math.pi, 0.0), (3.0, 0.0))),
+    "cart-pole up 10 N": (_CART, _DOWN),
+    "cart-pole up 5 N": (dataclasses.replace(_CART, low=(-5.0,), high=(5.0,)), _DOWN),
 }
 
 
 class Peer:
-    """IPOPT on the program that a `DirectShooting` solves on a mesh."""
+    """IPOPT on a mesh of Runge-Kutta steps, as `DirectShooting` solves it; (x - goal)'P(x - goal) at the end.
 
-    def __init__(self, case: RivalPlant, shooting: adp.DirectShooting, lengths: Tensor) -> None:
+    A control is linear on an interval, its values at both ends free; or it is held.
+    """
+
+    def __init__(self, case: RivalPlant, p: Tensor, lengths: Tensor, held: bool = False) -> None:
         n, m, steps = case.dim, case.inputs, len(lengths)
-        self.case, self.sizes = case, (n, m, steps)
-        assert shooting.lqr is not None
+        size = m if held else 2 * m
+        self.case, self.sizes = case, (size, m, steps)
         goal = case.goal().tolist()
         weights = case.weights
 
@@ -126,78 +113,71 @@ class Peer:
             paid = sum(q * e**2 for q, e in zip(weights[0], deviation(x), strict=True))
             return casadi.vertcat(*parts), paid + sum(r * u[j] ** 2 for j, r in enumerate(weights[1]))
 
-        x, v, h = casadi.MX.sym("x", n), casadi.MX.sym("v", 2 * m), casadi.MX.sym("h")
-        first, last = v[:m], v[m:]
+        x, v, h = casadi.MX.sym("x", n), casadi.MX.sym("v", size), casadi.MX.sym("h")
+        first, last = v[:m], v[size - m :]
         k1, c1 = motion(x, first)
         k2, c2 = motion(x + 0.5 * h * k1, 0.5 * (first + last))
         k3, c3 = motion(x + 0.5 * h * k2, 0.5 * (first + last))
         k4, c4 = motion(x + h * k3, last)
         after, paid = x + h / 6 * (k1 + 2 * (k2 + k3) + k4), h / 6 * (c1 + 2 * (c2 + c3) + c4)
         step = casadi.Function("step", [x, v, h], [after, paid])
-        states, controls = casadi.MX.sym("X", n, steps + 1), casadi.MX.sym("V", 2 * m, steps)
+        states, controls = casadi.MX.sym("X", n, steps + 1), casadi.MX.sym("V", size, steps)
         start = casadi.MX.sym("p", n)
         moved, costs = step.map(steps)(states[:, :-1], controls, casadi.DM(lengths.tolist()).T)
         end = casadi.vertcat(*deviation(states[:, -1]))
         program = {
             "x": casadi.vertcat(casadi.vec(states), casadi.vec(controls)),
             "p": start,
-            "f": casadi.sum2(costs) + casadi.bilin(shooting.lqr.p.numpy(), end, end),
+            "f": casadi.sum2(costs) + casadi.bilin(p.numpy(), end, end),
             "g": casadi.vertcat(states[:, 0] - start, casadi.vec(states[:, 1:] - moved)),
         }
         quiet = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False, "error_on_fail": False}
         self.solver = casadi.nlpsol("peer", "ipopt", program, {**quiet, "ipopt.max_iter": 500})
         free = np.full(n * (steps + 1), np.inf)
-        self.low = np.concatenate([-free, np.tile(case.low, 2 * steps)])
-        self.high = np.concatenate([free, np.tile(case.high, 2 * steps)])
+        self.low = np.concatenate([-free, np.tile(case.low, size // m * steps)])
+        self.high = np.concatenate([free, np.tile(case.high, size // m * steps)])
 
     def solve(self, x0: Tensor, states: np.ndarray, controls: np.ndarray) -> float:
-        """The cost that it finds from a guess (T + 1, n), (T, 2 m); inf where it gives up."""
+        """The cost that it finds from a guess (T + 1, n), (T, m or 2 m); inf where it gives up."""
         guess = np.concatenate([states.ravel(), np.clip(controls.ravel(), self.low[-1], self.high[-1])])
         bounds = {"lbx": self.low, "ubx": self.high, "lbg": 0.0, "ubg": 0.0}
         found = self.solver(x0=guess, p=x0.numpy(), **bounds)
         return float(found["f"]) if self.solver.stats()["success"] else math.inf
 
-    def guesses(
-        self, x0: Tensor, found: tuple[Tensor, Tensor] | None, count: int, draw: np.random.Generator
-    ) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Half of them at and around a plan (T + 1, n), (T, 2 m) where there is one, the others cold."""
-        _, m, steps = self.sizes
-        low, high = np.tile(self.case.low, 2), np.tile(self.case.high, 2)
-        several = []
-        if found is not None:
-            x, v = found[0].numpy(), found[1].numpy()
-            for k in range((count + 1) // 2):
-                shake = 0.1 * k
-                several.append(
-                    (
-                        x + shake * draw.normal(size=x.shape),
-                        v + shake * (high - low) * draw.normal(size=v.shape),
-                    )
-                )
-        while len(several) < count:
+    def costs(
+        self, x0: Tensor, plan: tuple[Tensor, Tensor] | None, count: int, draw: np.random.Generator
+    ) -> list[float]:
+        """What it finds from so many guesses: half at and around a plan, if there is one, the others cold."""
+        size, m, steps = self.sizes
+        low, high = (np.tile(each, size // m) for each in (self.case.low, self.case.high))
+        found = []
+        for k in range((count + 1) // 2 if plan else 0):
+            x, v = (part.numpy() for part in plan)
+            shaken = v + 0.1 * k * (high - low) * draw.normal(size=v.shape)
+            found.append(self.solve(x0, x + 0.1 * k * draw.normal(size=x.shape), shaken))
+        while len(found) < count:
             goal = self.case.goal().numpy().copy()
             for i in self.case.periodic:
                 goal[i] += 2 * math.pi * draw.integers(-1, 2)
             share = np.linspace(0, 1, steps + 1)[:, None] ** 0.5
             jumps = np.sign(draw.normal(size=(steps // 8 + 1, m))).repeat(8, 0)[:steps]
-            level = np.tile(jumps, 2)
-            size = np.minimum(high, 20.0)
-            several.append(((1 - share) * x0.numpy() + share * goal, level * size))
-        return several
+            states = (1 - share) * x0.numpy() + share * goal
+            found.append(self.solve(x0, states, np.tile(jumps, size // m) * np.minimum(high, 20.0)))
+        return found
 
 
-def checked(name: str, shot: Shot, count: int, starts: int, seed: int) -> list[Row]:
+def checked(name: str, count: int, starts: int, seed: int) -> list[Row]:
     """A row a state."""
-    case = shot.case
-    shooting = adp.DirectShooting(case.plant(), case.cost(), **shot.options)
-    x0 = torch.tensor(shot.first, dtype=torch.float64).reshape(-1, case.dim)
-    if shot.draws:
-        x0 = torch.cat((x0, case.states(count, seed)))
+    case, first = SHOTS[name]
+    shooting = adp.DirectShooting(case.plant(), case.cost())
+    assert shooting.lqr is not None
+    x0 = torch.tensor(first, dtype=torch.float64).reshape(-1, case.dim)
+    x0 = torch.cat((x0, case.states(count, seed)))
     began = time.process_time()
     best = shooting.solve(x0)
     spent = (time.process_time() - began) / len(x0)
     lengths = best.time.diff()
-    peer = Peer(case, shooting, lengths)
+    peer = Peer(case, shooting.lqr.p, lengths)
     costs = on_mesh(shooting, best, lengths)
     rows = []
     for k, state in enumerate(x0):
@@ -205,7 +185,7 @@ def checked(name: str, shot: Shot, count: int, starts: int, seed: int) -> list[R
         plan = None
         if bool(torch.isfinite(best.value[k])):
             plan = best.state[k], best.plan[k].flatten(-2)
-        values = [peer.solve(state, *guess) for guess in peer.guesses(state, plan, starts, draw)]
+        values = peer.costs(state, plan, starts, draw)
         ours, least = float(costs[k]), min(values)
         known = min(least, ours) if math.isfinite(ours) else least
         rows.append(
@@ -247,16 +227,13 @@ def main() -> None:
     parser.add_argument("--states", type=int, default=4, help="random ones a case")
     parser.add_argument("--starts", type=int, default=6, help="of IPOPT")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", type=Path)
     settings = parser.parse_args()
     torch.set_num_threads(1)
     print("| case | state | value on the mesh | over the least known | IPOPT's over it | said | CPU s |")
     print("|---" * 7 + "|")
     rows: list[Row] = []
     for name in settings.cases.split(","):
-        rows += checked(name, SHOTS[name], settings.states, settings.starts, settings.seed)
-    if settings.json is not None:
-        settings.json.write_text(json.dumps(rows, indent=2))
+        rows += checked(name, settings.states, settings.starts, settings.seed)
     claimed = [row for row in rows if row["converged"]]
     wrong = [row for row in claimed if row["over"] > 1 + _SAME]
     local = sum(row["reason"].startswith("local") for row in rows)

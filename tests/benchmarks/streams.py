@@ -5,10 +5,9 @@ runs over the first fifth, the one with the smallest error on its last two third
 stream, predicting each sample before it learns it, and is scored on the other four fifths (root mean square).
 `MixtureRegressor(1000)` has one default for all, and raw units. Before the table kafbox's Lorenz is
 reproduced (embedding 6, ALD-KRLS, -40.17 dB after 1000 samples). `--cache` keeps the peers' results, which
-take a quarter of an hour. `--earlier` and `--held-out` take the streams of streams_held_out.py, `--latest`
-those of streams_latest.py, `--sets` some by name; `--filter` tunes the
-filter alone, as peers are. Peers that are not installed are named and skipped:
-`pip install -e '.[bench]'`.
+take a quarter of an hour. `--earlier`, `--held-out` and `--latest` take the streams of streams_held_out.py,
+`--sets` some by name; `--filter` tunes the filter alone, as peers are. Peers that are not installed are named
+and skipped: `pip install -e '.[bench]'`.
 """
 
 from __future__ import annotations
@@ -17,25 +16,19 @@ import argparse
 import itertools
 import json
 import sys
-import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import peer_kernel_filters as kernels
+import peer_local_models as local
 import torch
+from streams_data import SETS, Series, lorenz
+from streams_held_out import EARLIER, HELD_OUT, LATEST
 
-ROOT = Path(__file__).parents[2]
-sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
-
-import peer_kernel_filters as kernels  # noqa: E402
-import peer_local_models as local  # noqa: E402
-from streams_data import SETS, Series, lorenz  # noqa: E402
-from streams_held_out import EARLIER, HELD_OUT  # noqa: E402
-from streams_latest import LATEST  # noqa: E402
-
-import staf_torch as st  # noqa: E402
+import staf_torch as st
 
 try:
     from peer_river import River
@@ -111,20 +104,18 @@ def tuned(make: Callable[..., Any], settings: Grid, x: np.ndarray, y: np.ndarray
     return rms(errors(make(**chosen), u, v)[first:]) * unit, chosen
 
 
-def own(series: Series, **arguments: Any) -> dict[str, list[float]]:
+def own(series: Series, filters: bool) -> dict[str, list[float]]:
     """Our error, rms of error / standard deviation, coverage of the 90 % band, an output each."""
-    model = st.MixtureRegressor(**arguments) if arguments else st.StaFRegressor()
+    model = st.StaFRegressor() if filters else st.MixtureRegressor(1000, 56)
     mean, std = np.zeros_like(series.y), np.ones_like(series.y)
     x, y = torch.as_tensor(series.x), torch.as_tensor(series.y)
-    if not arguments:
+    if isinstance(model, st.StaFRegressor):
         model.tune(x[: len(x) // 5], y[: len(x) // 5])
-    start = time.process_time()
     for k in range(len(x)):
         if k:
             found, deviation = model.predict(x[k], return_std=True)
             mean[k], std[k] = found.numpy(), deviation.numpy()
         model.partial_fit(x[k], y[k])
-    spent = (time.process_time() - start) / len(x)
     late = slice(len(x) // 5, None)
     error = (mean - series.y)[late]
     z = error / std[late]
@@ -132,7 +123,6 @@ def own(series: Series, **arguments: Any) -> dict[str, list[float]]:
         "error": [rms(e) for e in error.T],
         "z": [rms(e) for e in z.T],
         "covered": [float((np.abs(e) < 1.645).mean()) for e in z.T],
-        "us": [1e6 * spent] * error.shape[1],
     }
 
 
@@ -144,7 +134,7 @@ def kafbox_lorenz(count: int = 10_000) -> float:
     return float(10 * np.log10(np.mean(np.square(found[1000:]))))
 
 
-def rows(names: list[str], cache: Path | None, arguments: dict[str, Any]) -> list[dict[str, Any]]:
+def rows(names: list[str], cache: Path | None, filters: bool) -> list[dict[str, Any]]:
     """A row an output of every set: the peers' errors and our own."""
     kept = json.loads(cache.read_text()) if cache and cache.exists() else {}
     found = []
@@ -154,7 +144,7 @@ def rows(names: list[str], cache: Path | None, arguments: dict[str, Any]) -> lis
         except ImportError as missing:
             print(f"{name} skipped: {missing}", file=sys.stderr)
             continue
-        ours = own(series, **arguments)
+        ours = own(series, filters)
         for k in range(series.y.shape[1]):
             label = f"{name} {k + 1}" if series.y.shape[1] > 1 else name
             peers = {}
@@ -208,8 +198,6 @@ def main() -> None:
     ):
         parser.add_argument(name, action="store_const", dest="which", const=which, default=SETS, help=told)
     parser.add_argument("--filter", action="store_true", help="tuned on the first fifth, not the bank")
-    parser.add_argument("--memory", type=int, default=1000)
-    parser.add_argument("--neighbours", type=int, default=56)
     parser.add_argument("--no-kafbox", action="store_true", help="do not reproduce kafbox's Lorenz first")
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -219,10 +207,8 @@ def main() -> None:
         print(f"kafbox's Lorenz, ALD-KRLS: {kafbox_lorenz():.2f} dB (printed by kafbox: -40.17 dB)\n")
     print("| set | ours | best peer | ratio | " + " | ".join(COMPARED) + " | z rms | 90 % band |")
     print("|---|---:|---:|---:|" + "---:|" * (len(COMPARED) + 2), flush=True)
-    accurate = {"memory": options.memory, "neighbours": options.neighbours}
-    arguments = {} if options.filter else accurate
     names = options.sets or list(options.which)
-    print("\n" + summary(rows(names, options.cache, arguments)))
+    print("\n" + summary(rows(names, options.cache, options.filter)))
 
 
 if __name__ == "__main__":

@@ -7,8 +7,9 @@ scikit-learn, pmdarima, arch, vega_datasets (`pip install -e '.[bench]'`).
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -55,14 +56,25 @@ def mackey_glass(delay: int, count: int, every: int = 6, start: float = 0.89) ->
     return x[past :: every * fine][:count]
 
 
+def orbit(
+    step: Callable[..., tuple[Any, ...]], start: tuple[Any, ...], count: int, every: int = 1, skip: int = 100
+) -> Array:
+    """States of a map (step, *state) -> state, every so many steps, without the first: (count, n)."""
+    state, found = start, []
+    for k in range((count + skip) * every):
+        if k % every == 0:
+            found.append(state)
+        state = step(k, *state)
+    return np.array(found[skip:])
+
+
 def lorenz(count: int) -> Array:
     """The third coordinate by Euler steps of .01 from (10, 7, 35): kafbox's lorenz.dat to its six digits."""
-    x, y, z = 10.0, 7.0, 35.0
-    found = []
-    for _ in range(count):
-        found.append(z)
-        x, y, z = x + 0.1 * (y - x), y + 0.01 * (x * (28 - z) - y), z + 0.01 * (x * y - 8 / 3 * z)
-    return np.array(found)
+
+    def step(k: int, x: float, y: float, z: float) -> tuple[float, float, float]:
+        return x + 0.1 * (y - x), y + 0.01 * (x * (28 - z) - y), z + 0.01 * (x * y - 8 / 3 * z)
+
+    return orbit(step, (10.0, 7.0, 35.0), count, skip=0)[:, 2]
 
 
 def henon(count: int) -> Array:
@@ -115,35 +127,35 @@ def arm(count: int, seed: int = 3, second: float = 1.0) -> Series:
     return Series(np.concatenate((q, v, a)).T, y + 0.05 * draw.standard_normal(y.shape))
 
 
-def _seattle() -> Series:
+def vega(name: str, column: str) -> Array:
     from vega_datasets import local_data
 
-    return embedded(local_data.seattle_temps()["temp"].to_numpy(), 4)
+    return getattr(local_data, name)()[column].to_numpy(float)
 
 
-def _trump() -> Series:
-    from river.datasets import TrumpApproval
+def _river(name: str) -> Series:
+    import river.datasets
 
-    rows = list(TrumpApproval())
-    return Series(np.array([list(x.values()) for x, _ in rows], float), np.array([[y] for _, y in rows]))
-
-
-def _chick() -> Series:
-    from river.datasets import ChickWeights
-
-    rows = list(ChickWeights())
+    rows = list(getattr(river.datasets, name)())
     return Series(
         np.array([list(x.values()) for x, _ in rows], float), np.array([[y] for _, y in rows], float)
     )
 
 
-def _pmdarima(name: str) -> Array:
+def _water() -> Array:
+    from river.datasets import WaterFlow
+
+    return np.array([y for _, y in WaterFlow()])
+
+
+def pmdarima(name: str) -> Array:
     import pmdarima.datasets as packaged
 
-    return np.asarray(getattr(packaged, f"load_{name}")(), float)
+    values = np.asarray(getattr(packaged, f"load_{name}")(), float)
+    return values[np.isfinite(values)]
 
 
-def _statsmodels(name: str, column: str) -> Array:
+def statsmodels(name: str, column: str) -> Array:
     from statsmodels import datasets
 
     values = getattr(datasets, name).load_pandas().data[column].astype(float)
@@ -156,17 +168,9 @@ def _el_nino() -> Array:
     return datasets.elnino.load_pandas().data.iloc[:, 1:].to_numpy(float).ravel()
 
 
-def _arch(name: str, column: str) -> Array:
-    import importlib
-
-    values = importlib.import_module(f"arch.data.{name}").load()[column].astype(float)
-    return values.dropna().to_numpy()
-
-
-def _water() -> Array:
-    from river.datasets import WaterFlow
-
-    return np.array([y for _, y in WaterFlow()])
+def arch(name: str, *columns: str) -> Array:
+    values = importlib.import_module(f"arch.data.{name}").load()[list(columns)].astype(float)
+    return values.dropna().to_numpy().squeeze()
 
 
 def _diabetes() -> Series:
@@ -189,20 +193,20 @@ SETS: dict[str, Callable[[], Series]] = {
     "Lorenz +10": lambda: embedded(lorenz(1700), 6, ahead=10),
     "channel equalisation": lambda: equalisation(MOST),
     "channel switch": channel_switch,
-    "Seattle temperature": _seattle,
-    "Trump approval": _trump,
-    "Taylor load": lambda: embedded(_pmdarima("taylor"), 3),
-    "CO2": lambda: embedded(_statsmodels("co2", "co2"), 4),
-    "VIX": lambda: embedded(_arch("vix", "vix"), 3),
+    "Seattle temperature": lambda: embedded(vega("seattle_temps", "temp"), 4),
+    "Trump approval": lambda: _river("TrumpApproval"),
+    "Taylor load": lambda: embedded(pmdarima("taylor"), 3),
+    "CO2": lambda: embedded(statsmodels("co2", "co2"), 4),
+    "VIX": lambda: embedded(arch("vix", "vix"), 3),
     "arm": lambda: arm(1200),  # two outputs, two sets
     "WaterFlow": lambda: embedded(_water(), 4),
     "MG30 noisy": lambda: embedded(_noisy(), 7),
-    "chick weights": _chick,
+    "chick weights": lambda: _river("ChickWeights"),
     "diabetes": _diabetes,
-    "airline": lambda: embedded(_pmdarima("airpassengers"), 3),
+    "airline": lambda: embedded(pmdarima("airpassengers"), 3),
     "El Nino": lambda: embedded(_el_nino(), 12),
-    "sunspots": lambda: embedded(_statsmodels("sunspots", "SUNACTIVITY"), 3),
-    "lynx": lambda: embedded(np.log(_pmdarima("lynx")), 2),
-    "crude oil": lambda: embedded(_arch("wti", "DCOILWTICO"), 3),
-    "heart rate": lambda: embedded(_pmdarima("heartrate"), 4),
+    "sunspots": lambda: embedded(statsmodels("sunspots", "SUNACTIVITY"), 3),
+    "lynx": lambda: embedded(np.log(pmdarima("lynx")), 2),
+    "crude oil": lambda: embedded(arch("wti", "DCOILWTICO"), 3),
+    "heart rate": lambda: embedded(pmdarima("heartrate"), 4),
 }

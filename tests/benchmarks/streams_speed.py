@@ -7,17 +7,14 @@ that `forecast` and devices run, all steps in one call, against which the hand-w
 
 from __future__ import annotations
 
-import sys
+import statistics
 import time
-from pathlib import Path
 
 import torch
+from timing import spent
 from torch import Tensor
 
-sys.path[:0] = [str(Path(__file__).parents[2])]
-
-import staf_torch as st  # noqa: E402
-from staf_torch import lanes  # noqa: E402
+import staf_torch as st
 
 NOISE, FORGETTING = 0.05, 0.999
 
@@ -35,17 +32,11 @@ def regressor(dim: int, count: int) -> st.StaFRegressor:
 
 def many(dim: int, count: int, dtype: torch.dtype, streams: int = 10_000, steps: int = 20) -> str:
     model, samples = regressor(dim, count), path(streams, dim, steps + 20, dtype)
-    spent: list[list[float]] = [[], []]
-    for k, (x, y) in enumerate(samples):
-        start = time.process_time()
-        if k >= 20:
-            model.predict(x)
-            spent[0].append(time.process_time() - start)
-            start = time.process_time()
-        model.partial_fit(x, y)
-        if k >= 20:
-            spent[1].append(time.process_time() - start)
-    predict, learn = (1e6 * sorted(part)[len(part) // 2] / streams for part in spent)
+    times: list[tuple[float, float]] = []
+    for x, y in samples:
+        predicted = spent(lambda x=x: model.predict(x))[0] if len(times) >= 20 else 0.0
+        times.append((predicted, spent(lambda x=x, y=y: model.partial_fit(x, y))[0]))
+    predict, learn = (1e6 * statistics.median_high(part) / streams for part in zip(*times[20:], strict=True))
     name = str(dtype).removeprefix("torch.")
     return (
         f"{streams} streams, n = {dim}, M = {count}, {name}: predict {predict:.3f} us, learn {learn:.3f} us"
@@ -72,46 +63,8 @@ def as_row_program(dim: int, count: int, streams: int = 10_000, steps: int = 20)
         if k:
             errors.append((model.predict(point) - found[k]).abs().max())
         model.partial_fit(point, value)
-    spent = []
-    for _ in range(5):
-        begin = time.process_time()
-        model.forecast(x, y)
-        spent.append(time.process_time() - begin)
-    each = 1e6 * sorted(spent)[2] / streams / steps
+    each = 1e6 * statistics.median(spent(lambda: model.forecast(x, y))[0] for _ in range(5)) / streams / steps
     return f"{each:.3f} us to predict and learn, {float(max(errors)):.1e} from the regressor"
-
-
-def processes_as_row_program(streams: int, neighbours: int = 32) -> str:
-    """The largest part of the bank, its 24 Gaussian processes of the nearest samples, a stream a lane."""
-    rates = torch.tensor([0.5, 1.0, 2.0]).double().repeat(8)
-    fades = torch.tensor([0.0, 0.01, 0.05, 0.1]).double().repeat_interleave(6)
-    eye = 1e-3 * torch.eye(neighbours, dtype=torch.float64)
-
-    def step(carry: tuple[()], _: tuple[()], row: tuple[Tensor, ...]) -> tuple[tuple[()], Tensor]:
-        points, y, when = row
-        square = (points.unsqueeze(2) - points.unsqueeze(1)).square().sum(-1)
-        age = (when.unsqueeze(2) - when.unsqueeze(1)).abs()
-
-        def process(_: tuple[()], rule: tuple[Tensor, Tensor]) -> tuple[tuple[()], Tensor]:
-            kernel = (-rule[0] * square - rule[1] * age).exp()
-            factor = torch.linalg.cholesky_ex(kernel[:, :-1, :-1] + eye).L
-            sides = torch.stack((y, kernel[:, :-1, -1]), -1)
-            beta, seen = torch.linalg.solve_triangular(factor, sides, upper=False).unbind(-1)
-            return (), torch.stack(((beta * seen).sum(-1), seen.square().sum(-1), beta.square().sum(-1)), -1)
-
-        return carry, lanes.scan(process, (), (rates, fades), dim=0)[1].transpose(0, 1)
-
-    generator = torch.Generator().manual_seed(0)
-    shapes = (neighbours + 1, 4), (neighbours,), (neighbours + 1,)
-    row = tuple(torch.rand(streams, *shape, generator=generator).double() for shape in shapes)
-    program, spent = lanes.Program(step), []
-    if not program.compiles((), (), row, steps=1):
-        return "is not compiled"
-    for _ in range(30):
-        begin = time.process_time()
-        program((), (), row, steps=1)
-        spent.append(time.process_time() - begin)
-    return f"{1e6 * sorted(spent)[15] / streams:.0f} us a stream"
 
 
 def main() -> None:
@@ -124,10 +77,6 @@ def main() -> None:
     for neighbours in (32, 56):
         model = st.MixtureRegressor(1000, neighbours)
         print(f"one stream, bank of {neighbours} neighbours, n = 4: {single(model, 4)}")
-    for streams in (1, 8):
-        print(
-            f"its 24 processes alone as a row program, streams {streams}: {processes_as_row_program(streams)}"
-        )
     print(f"M = 6 as a row program, float64: {as_row_program(2, 6)}")
 
 

@@ -104,10 +104,10 @@ def test_an_exported_file_computes_what_the_run_recorded(
 
 
 @needs_cc
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
-def test_a_controller_that_learns_follows_its_run_in_c(dtype: str, runs: Path, tmp_path: Path) -> None:
+def test_a_controller_that_learns_follows_its_run_in_c(runs: Path, tmp_path: Path) -> None:
+    dtype = "float64"
     page = export_learning(runs / "actor", dtype=dtype, output=tmp_path / "learner.h", row=1, calls=20)
-    assert page["equality"]["u"] < (1e-12 if dtype == "float64" else 1e-4)
+    assert page["equality"]["u"] < 1e-12
     assert [port["name"] for port in page["inputs"]] == ["x", "uniform"]
     assert (page["to"], page["dtype"], page["batch"]) == ("c", dtype, 1)
     assert (tmp_path / "learner.h.md").exists()
@@ -138,37 +138,28 @@ def test_a_run_of_every_policy_is_rebuilt_and_compared_over_the_region_that_it_v
     found, states = deployable(runs / name), history(runs / name)["state"][0]
     points = found.points.numpy()
     assert points.shape == (1000, 2)
-    assert torch.equal(deployable(runs / name, 0).points, found.points)
     if name == "chase":
-        away = (points - states[-1]) / 0.1
-        lengths = np.linalg.norm(away, axis=1)
-        assert lengths.max() < 1 + 1e-9
-        for radius in (0.25, 0.5, 0.75):  # evenly spread over the disc
-            assert abs((lengths < radius).mean() - radius**2) < 0.06
+        share = np.linalg.norm((points - states[-1]) / 0.1, axis=1) ** 2  # of the disc
         assert found.input.region.startswith("the ball of radius 0.1 around (")
     else:
         share = (points - states.min(0)) / (states.max(0) - states.min(0))
-        assert 0 <= share.min() <= share.max() <= 1
-        for limit in (0.25, 0.5, 0.75):  # evenly spread over the box
-            np.testing.assert_allclose((share < limit).mean(0), limit, atol=0.06)
         assert found.input.region.startswith("visited: [")
+    assert 0 <= share.min() <= share.max() <= 1 + 1e-9
+    for limit in (0.25, 0.5, 0.75):  # evenly spread
+        np.testing.assert_allclose((share < limit).mean(0), limit, atol=0.06)
     out = found.module(torch.float64)(found.points[:4])
     assert all(torch.isfinite(part).all() for part in (out if isinstance(out, tuple) else (out,)))
     learns = name in ("actor", "guarded", "quadrature")
     assert found.what.endswith(", 3 actor weights as they were at the end.") == learns
 
 
-@pytest.mark.parametrize("row", [0, 1])
-def test_a_learner_sees_the_states_and_random_numbers_of_its_run(row: int, runs: Path) -> None:
-    found = learning(runs / "actor", row)
+def test_a_learner_sees_the_states_and_random_numbers_of_its_run(runs: Path) -> None:
+    row, found = 1, learning(runs / "actor", 1)
     np.testing.assert_allclose(found.states[::2], history(runs / "actor")["state"][row, :-1], rtol=1e-9)
     step = torch.arange(20, dtype=torch.float64)
     drawn = philox.uniform(philox.seed_parts([row], step).expand(20, 4), step, 2)
     assert torch.equal(found.uniform[:, 0], drawn)
     assert (found.dt, found.written_by) == (0.005, None)
-    plain = learning(runs / "quadrature")  # which draws no random numbers
-    assert [port.name for port in plain.inputs] == ["x"]
-    assert plain.uniform.shape == (10, 0, 2)
 
 
 @needs_cc
@@ -194,10 +185,6 @@ def test_near_optimal_with_bounds_is_exported_with_its_plan_or_as_a_function_of_
     assert "without the plans" in page["what"]
     assert page["name"] == "class_run"  # class is no name in C++
     assert "void class_run(const double state[2], double" in (run / "export" / "controller.h").read_text()
-    with pytest.raises(
-        ValueError, match=r"`staf-export\(name=...\)` must be free names of C and C\+\+; got 'new'"
-    ):
-        export(run, "c", name="new")
 
 
 # Refusals
@@ -237,11 +224,9 @@ def test_what_is_no_run_of_a_controller_is_refused(changed: Callable[..., Path],
         (lambda: learning(runs / "lqr"), r"`staf-export\(learning=...\)` must be omitted.*'Feedback'"),
         (lambda: learning(runs / "chase"), "must be a run of adp; got 'gradient_chase'"),
         (lambda: deployable(changed("chase", task="laws")), "must be a run of gradient_chase or adp; got"),
-        (lambda: deployable(changed("chase", {"state": np.zeros(())})), "has no states of trajectories"),
         (lambda: deployable(changed("chase", {"weights": weights})), "weights can be represented"),
         (lambda: export(runs / "chase", "no"), r"`staf-export\(to=...\)` must be one of"),
         (lambda: export(runs / "chase", "pt2", dtype="no"), r"`staf-export\(dtype=...\)` must be one of"),
-        (lambda: export(runs / "chase", "pt2", row=-1), r"\(row=...\)` must be at least 0; got -1"),
         (lambda: export(runs / "chase", "pt2", row=2), "must be below the run's 2 trajectories; got 2"),
     ]
     for call, said in cases:
@@ -271,7 +256,6 @@ def test_the_command_ends_with_a_page_or_one_sentence(
     assert capsys.readouterr().out == (run / "export" / "controller.pt2.md").read_text()
     assert json.loads((run / "export" / "controller.pt2.json").read_text())["batch"] == 3
     for words, said in (
-        ([str(run), "--to", "pt2", "--row", "1"], "must be below the run's 1 trajectories; got 1"),
         ([str(run.parent), "--to", "pt2"], "must be a run directory"),
         ([str(run), "--to", "pt2", "--learning"], "must go with --to c"),
         ([str(run), "--to", "c", "--learning", "--batch", "2"], "must be 1 for a controller that learns"),
@@ -282,10 +266,8 @@ def test_the_command_ends_with_a_page_or_one_sentence(
     (run / "history.npz").unlink()
     with pytest.raises(SystemExit, match="history=false"):
         main([str(run), "--to", "pt2"])
-    for words in (["b"], ["b", "--to", "no"], ["--to", "c"], ["b", "--to", "c", "--dtype", "half"]):
-        with pytest.raises(SystemExit) as ended:
-            main(words)
-        assert ended.value.code == 2
+    with pytest.raises(SystemExit, match="2"):
+        main(["b", "--to", "no"])
     assert capsys.readouterr().err.startswith("usage: staf-export ")
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -64,17 +63,8 @@ def test_memory_in_c_has_the_control_of_the_library_and_says_what_a_call_takes(
     torch.testing.assert_close(u, memory(x), rtol=0, atol=1e-12)
     torch.testing.assert_close(policy(x), memory(x), rtol=0, atol=1e-12)
     assert 0.1 < float((u.abs() < 2).double().mean()) < 1  # not a bound everywhere
-    one = source.functions / (memory.candidates + 1)
-    assert one == int(one) >= memory.lookahead  # a sine a step
-    tables = sum(part.numel() for part in (policy.plans, policy.models, policy.searched))
-    assert tables < source.constants < tables + 100
-    a_plan = source.flops - len(policy.searched) * (3 * 2 + 1) - 2 * (2 * 2 + 4)  # without the comparisons
-    assert a_plan % (memory.candidates + 1) == 0
     said = f"compares {2 * len(memory.entries)} states and takes at most {source.flops} additions"
     assert said in path.read_text()
-    assert "rint(" in path.read_text()
-    (follows,) = re.findall(r"void remembered_follow\(([^)]*)\)", path.read_text())
-    assert re.findall(r"\w+(?=\[|,|$)", follows)[-2:] == ["cost", "control"], follows
     timed = deploy.time_c(path, x, [1])
     assert timed.calls == 80
     assert 0 < timed.median_us <= timed.p99_us <= timed.worst_us
@@ -89,18 +79,9 @@ def test_memory_in_float_chooses_nearly_the_same_control(memory: adp.GlobalValue
     assert "rintf(" in path.read_text()
 
 
-def test_traced_memory_has_the_control_of_the_library_at_every_batch() -> None:
-    x, problem = states(20), double_integrator(-1.0, 1.0)
-    library = library_of(problem, torch.tensor([[0.3, 0.0], [-0.2, 0.1]]).double())
-    short = adp.GlobalValue(problem, library, [1.0, 1.0], candidates=1, lookahead=1)
-    program = deploy.trace(deploy.policy_of(short), x).module()  # what ONNX, pt2 and aoti are written from
-    for rows in (x, x[:1]):
-        torch.testing.assert_close(program(rows), short(rows), rtol=0, atol=1e-12)
-
-
 @needs_cc
-@pytest.mark.parametrize("kind", ["followed", "sampled"])
-def test_plan_that_is_carried_is_a_structure_in_c(kind: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("kind", "dtype"), [("followed", torch.float32), ("sampled", torch.float64)])
+def test_plan_that_is_carried_is_a_structure_in_c(kind: str, dtype: torch.dtype, tmp_path: Path) -> None:
     problem = double_integrator(-1.0, 1.0)
     make: dict[str, Callable[[], adp.Controller]] = {
         "followed": lambda: adp.RecedingHorizon(problem, steps=12, iterations=0, compile=False),
@@ -109,7 +90,7 @@ def test_plan_that_is_carried_is_a_structure_in_c(kind: str, tmp_path: Path) -> 
     controller = make[kind]()
     x0 = torch.tensor([[2.0, 0.5]], dtype=torch.float64)
     path = tmp_path / "plan.h"
-    deploy.export_learning_c(controller, x0, path, dt=0.1)
+    deploy.export_learning_c(controller, x0.to(dtype), path, dt=0.1)
     generator = torch.Generator().manual_seed(0)
     x = x0 * torch.linspace(1, 0.1, 16, dtype=torch.float64).unsqueeze(1)  # 4 steps beyond the plan
     uniform = 2 * torch.rand(16, controller.draws, 2, dtype=torch.float64, generator=generator) - 1
@@ -117,16 +98,17 @@ def test_plan_that_is_carried_is_a_structure_in_c(kind: str, tmp_path: Path) -> 
     for at, numbers in zip(x.split(1), uniform.split(1), strict=True):
         u, carried = controller.step(at, carried, numbers, 0.1)
         wanted.append(u)
-    found = runner_learning_c(path, controller.draws, 1, torch.float64)(x, uniform)
-    torch.testing.assert_close(found, torch.cat(wanted), rtol=0, atol=1e-9)
+    found = runner_learning_c(path, controller.draws, 1, dtype)(x.to(dtype), uniform.to(dtype))
+    away = 1e-9 if dtype == torch.float64 else 1e-4
+    torch.testing.assert_close(found, torch.cat(wanted).to(dtype), rtol=0, atol=away)
     assert bool((found.abs() < 1).any())
     with pytest.raises(ValueError, match="carries its plan from control to control"):
         deploy.policy_of(controller)
 
 
 @needs_cc
-@pytest.mark.parametrize("kind", ["energy", "near_optimal"])
-def test_feedback_of_a_plant_with_bounds_in_c(kind: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("kind", "dtype"), [("energy", torch.float64), ("near_optimal", torch.float32)])
+def test_feedback_of_a_plant_with_bounds_in_c(kind: str, dtype: torch.dtype, tmp_path: Path) -> None:
     plant, cost = systems.Pendulum(), adp.QuadraticCost(1.0, 1.0, 2, 1, low=-3.0, high=3.0)
     policy = (
         adp.EnergyShaping(
@@ -136,10 +118,9 @@ def test_feedback_of_a_plant_with_bounds_in_c(kind: str, tmp_path: Path) -> None
         else adp.near_optimal(plant, cost, dt=0.05, horizon=0.2, reach="local")
     )
     x, path = 0.2 * states(30), tmp_path / "policy.h"
-    module = deploy.policy_of(policy)
-    deploy.export_c(module, x, path, ["u"])
-    (u,) = runner_c(path, [1], torch.float64)(x)
-    torch.testing.assert_close(u, policy(x), rtol=0, atol=1e-9)
+    deploy.export_c(deploy.policy_of(policy, dtype=dtype), x.to(dtype), path, ["u"])
+    (u,) = runner_c(path, [1], dtype)(x.to(dtype))
+    torch.testing.assert_close(u, policy(x).to(dtype), rtol=0, atol=1e-9 if dtype == torch.float64 else 1e-3)
     assert bool((u.abs() < 3).any())
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pickle
 import zipfile
 
-from arena import Arena, Attack, Call, attack
+from arena import ATTACKS, Arena, Attack, Call, attack
 
 
 @attack
@@ -15,21 +15,43 @@ def target_through_a_module_of_ours(arena: Arena) -> Attack:
     return arena.set("kernel", {"_target_": target, "f": str(arena.one / "evil.pt"), "weights_only": False})
 
 
-@attack
-def a_partial_of_os_system(arena: Arena) -> Attack:
-    return arena.set("target", {"_target_": "os.system", "_partial_": True, "command": arena.touch})
+def with_module(arena: Arena, key: str, value: object) -> Attack:
+    """A key of the settings that names a module which lies beside the run and where the command starts."""
+    arena.module(arena.one)
+    arena.module(arena.cwd)
+    return arena.set(key, value)
 
 
-@attack
-def a_target_within_a_list_argument(arena: Arena) -> Attack:
-    inner = [{"_target_": "subprocess.check_output", "args": ["touch", f"{arena.victim}/PWNED"]}]
-    return arena.set("kernel", {"_target_": "staf_torch.GaussianKernel", "width": inner})
-
-
-@attack
-def a_target_among_positional_arguments(arena: Arena) -> Attack:
-    inner = {"_target_": "os.system", "command": arena.touch}
-    return arena.set("kernel", {"_target_": "staf_torch.GaussianKernel", "_args_": [inner]})
+GAUSSIAN, BALL = {"_target_": "staf_torch.GaussianKernel"}, {"layout": "ball", "count": 10**8, "radius": 0.1}
+CALL = "subprocess.check_output"
+ATTACKS.update(
+    {
+        "a_partial_of_os_system": lambda arena: arena.set(
+            "target", {"_target_": "os.system", "_partial_": True, "command": arena.touch}
+        ),
+        "a_target_within_a_list_argument": lambda arena: arena.set(
+            "kernel", GAUSSIAN | {"width": [{"_target_": CALL, "args": ["touch", f"{arena.victim}/PWNED"]}]}
+        ),
+        "a_target_among_positional_arguments": lambda arena: arena.set(
+            "kernel", GAUSSIAN | {"_args_": [{"_target_": "os.system", "command": arena.touch}]}
+        ),
+        "a_target_of_ones_own_beside_the_run": lambda arena: with_module(
+            arena, "target", {"_target_": "staf_torch.settings.chase.custom", "path": "evil_mod.V"}
+        ),
+        "a_task_that_is_a_path": lambda arena: with_module(arena, "task", "evil_mod.V"),
+        "text_where_a_number_belongs": lambda arena: arena.set(
+            "dt", f"__import__('os').system('{arena.touch}')"
+        ),
+        "a_hundred_million_centers": lambda arena: arena.set(
+            "centers",
+            {"_target_": "staf_torch.settings.chase.centers_of", "shrink": {"offset": None, "gain": 1.0}}
+            | BALL,
+        ),
+        "a_polynomial_of_degree_a_billion": lambda arena: arena.set(
+            "kernel", {"_target_": "staf_torch.PolynomialKernel", "degree": 10**9, "bias": 1.0}
+        ),
+    }
+)
 
 
 @attack
@@ -42,30 +64,11 @@ def a_python_tag_in_yaml(arena: Arena) -> Attack:
 
 
 @attack
-def a_target_of_ones_own_beside_the_run(arena: Arena) -> Attack:
-    arena.module(arena.one)
-    arena.module(arena.cwd)
-    return arena.set("target", {"_target_": "staf_torch.settings.chase.custom", "path": "evil_mod.V"})
-
-
-@attack
-def a_task_that_is_a_path(arena: Arena) -> Attack:
-    arena.module(arena.one)
-    arena.module(arena.cwd)
-    return arena.set("task", "evil_mod.V")
-
-
-@attack
 def metric_tracker_and_predictor(arena: Arena) -> Attack:
     arena.module(arena.cwd)
     for key in ("metric", "tracker", "predictor"):
         arena.config(lambda found, key=key: found.__setitem__(key, {"_target_": "evil_mod.V"}))
     return arena.export()
-
-
-@attack
-def text_where_a_number_belongs(arena: Arena) -> Attack:
-    return arena.set("dt", f"__import__('os').system('{arena.touch}')")
 
 
 @attack
@@ -87,27 +90,8 @@ def pickles_in_the_history(arena: Arena) -> Attack:
 
 
 @attack
-def a_hundred_million_centers(arena: Arena) -> Attack:
-    return arena.set(
-        "centers",
-        {
-            "_target_": "staf_torch.settings.chase.centers_of",
-            "layout": "ball",
-            "count": 10**8,
-            "radius": 0.1,
-            "shrink": {"offset": None, "gain": 1.0},
-        },
-    )
-
-
-@attack
-def a_polynomial_of_degree_a_billion(arena: Arena) -> Attack:
-    return arena.set("kernel", {"_target_": "staf_torch.PolynomialKernel", "degree": 10**9, "bias": 1.0})
-
-
-@attack
 def four_hundred_anchors(arena: Arena) -> Attack:
-    kernel = {"_target_": "staf_torch.GaussianKernel"}
+    kernel: dict[str, object] = GAUSSIAN
     for _ in range(400):
         kernel = {"_target_": "staf_torch.AnchoredKernel", "kernel": kernel}
     return arena.set("kernel", kernel)

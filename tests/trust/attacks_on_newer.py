@@ -7,7 +7,7 @@ import pickle
 import shutil
 from pathlib import Path
 
-from arena import Arena, Attack, Call, attack
+from arena import ATTACKS, Arena, Attack, Call, attack
 
 
 @attack
@@ -24,15 +24,11 @@ def an_environment_made_by_the_loader(arena: Arena) -> Attack:
     return arena.set("target", loader | {"arguments": {"id": "evil_mod:Evil-v0"}})
 
 
-@attack
-def a_secret_as_a_model_of_mujoco(arena: Arena) -> Attack:
-    model = str(arena.victim / "secret.txt")
-    return arena.set("system", {"_target_": "staf_torch.systems.MujocoPlant", "model": model})
-
-
-@attack
-def a_device_as_a_model_of_mujoco(arena: Arena) -> Attack:
-    return arena.set("system", {"_target_": "staf_torch.systems.MujocoPlant", "model": "/dev/zero"})
+MUJOCO = {"_target_": "staf_torch.systems.MujocoPlant"}
+ATTACKS["a_secret_as_a_model_of_mujoco"] = lambda arena: arena.set(
+    "system", MUJOCO | {"model": f"{arena.victim}/secret.txt"}
+)
+ATTACKS["a_device_as_a_model_of_mujoco"] = lambda arena: arena.set("system", MUJOCO | {"model": "/dev/zero"})
 
 
 @attack

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import socket
+from collections.abc import Callable
+from pathlib import Path
 
 from arena import ATTACKS, Arena, Attack, attack
 
@@ -20,6 +22,12 @@ def an_environment_for_jobs(arena: Arena) -> Attack:
 def a_sweeper_that_is_foreign(arena: Arena) -> Attack:
     arena.module(arena.cwd)
     return arena.line("hydra.sweeper._target_=evil_mod.V")
+
+
+def locked(arena: Arena, make: Callable[[Path], object]) -> Attack:
+    """A sweep with a lock that somebody made."""
+    make(arena.many / ".lock")
+    return arena.resume()
 
 
 @attack
@@ -56,18 +64,6 @@ def a_path_as_the_experiment(arena: Arena) -> Attack:
     folder.mkdir()
     (folder / "x.yaml").write_text("# @package _global_\ntask: evil_mod.V\n")
     arena.swept(f"experiment=../../..{folder}/x")
-    return arena.resume()
-
-
-@attack
-def a_lock_that_is_a_pipe(arena: Arena) -> Attack:
-    os.mkfifo(arena.many / ".lock")
-    return arena.resume()
-
-
-@attack
-def a_lock_that_is_a_link(arena: Arena) -> Attack:
-    (arena.many / ".lock").symlink_to(arena.victim / "note.txt")
     return arena.resume()
 
 
@@ -111,18 +107,22 @@ def modules_of_the_library_beside_the_runs(arena: Arena) -> Attack:
     return ["bash", "-c", f"cd {arena.many} && staf-table . && staf-export 0 --to c --calls 10"], None
 
 
-@attack
-def a_lock_of_everybody(arena: Arena) -> Attack:
-    (arena.many / ".lock").write_text(json.dumps({"host": socket.gethostname(), "pid": -1, "token": "x"}) * 2)
-    return arena.resume()
-
-
 ATTACKS.update(
     {
         "another_directory_of_the_sweep": lambda arena: arena.line(f"hydra.sweep.dir={arena.victim}"),
         "another_subdirectory": lambda arena: arena.line("hydra.sweep.subdir=../../victim/${hydra.job.num}"),
         "a_log_file_elsewhere": lambda arena: arena.line(
             f"hydra.job_logging.handlers.file.filename={arena.victim}/note.txt"
+        ),
+        "a_lock_that_is_a_pipe": lambda arena: locked(arena, os.mkfifo),
+        "a_lock_that_is_a_link": lambda arena: locked(
+            arena, lambda path: path.symlink_to(arena.victim / "note.txt")
+        ),
+        "a_lock_of_everybody": lambda arena: locked(
+            arena,
+            lambda path: path.write_text(
+                json.dumps({"host": socket.gethostname(), "pid": -1, "token": "x"}) * 2
+            ),
         ),
         "settings_elsewhere": lambda arena: arena.line(f"hydra.output_subdir={arena.victim}"),
     }

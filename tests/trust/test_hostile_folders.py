@@ -1,64 +1,118 @@
-"""Folders made to do harm: `staf-table` spares the other runs, `staf-export` runs nothing of theirs."""
+"""Folders made to do harm: most of what `attacks.py` tries in processes of their own, here in this one."""
 
 from __future__ import annotations
 
 import csv
 import io
 import json
-import pickle
-import shutil
-from html.parser import HTMLParser
+import os
+import re
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
+import attacks
 import pytest
-import torch
-from composing import settings
-from hostile_runs import CELLS, EXPORTS, TABLES
-from omegaconf import OmegaConf
+from arena import ATTACKS, SECRET, Arena
+from command_line import one
 from sweep_runs import write_run
 
+from staf_torch.cli import export
 from staf_torch.cli.deployable import deployable
-from staf_torch.cli.export import export
 from staf_torch.cli.table import main
-from staf_torch.deploy import data_sheet
-from staf_torch.experiments.registry import experiment
 from staf_torch.results.reader import collect
-from staf_torch.sweeps.hydra_compat.inside import HAS_WHITELIST
 from staf_torch.tables import html_text, json_text, latex_text, tabulate
 
-# `staf-table`
+SHORT = ["duration=0.1", "settle_time=0", "figures=false", "seed=3"]
+MAINS: dict[str, Callable[[list[str]], int | None]] = {"staf-table": main, "staf-export": export.main}
+COMPILED = "a_name_that_ends_an_include_in_c", "a_name_that_speaks"
+TRIED = """
+target_through_a_module_of_ours a_partial_of_os_system a_target_within_a_list_argument a_python_tag_in_yaml
+a_target_among_positional_arguments a_target_of_ones_own_beside_the_run a_task_that_is_a_path
+metric_tracker_and_predictor text_where_a_number_belongs the_environment_in_a_setting pickles_in_the_history
+a_history_whose_header_is_a_program an_environment_whose_id_names_a_module a_secret_as_a_model_of_mujoco
+slopes_that_are_a_call a_plant_within_a_barrier keys_merged_into_a_target interpolations_that_double
+controls_beyond_escape controls_in_the_name_of_a_job formulas_of_every_kind tex_in_caret_notation
+links_and_scripts_in_markdown a_loop_of_links files_that_are_no_files
+rows_of_every_type numbers_of_every_type_for_jobs a_table_written_over_its_source
+"""  # by `staf-table` and `staf-export`, without those that take memory or a second
 
 
-@pytest.mark.parametrize("name", TABLES)
-def test_no_hostile_run_costs_the_others_their_rows(
-    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.fixture(scope="module")
+def honest(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run, and a sweep of three, that mean no harm."""
+    folder = tmp_path_factory.mktemp("honest")
+    sweep = ["-m", "centers.radius=0.1,0.2,0.3", f"hydra.sweep.dir={folder}/many"]
+    for line in ([f"hydra.run.dir={folder}/one"], sweep):
+        code, _, err = one(str(folder), [*line, *SHORT])
+        assert code == 0, err
+    return folder
+
+
+@pytest.fixture
+def arena(honest: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Arena:
+    found = Arena(tmp_path / "arena")
+    found.lay_out(honest)
+    monkeypatch.chdir(found.cwd)
+    monkeypatch.syspath_prepend(str(found.cwd))
+    monkeypatch.setenv("STAF_SECRET", SECRET)
+    return found
+
+
+@pytest.mark.parametrize(
+    "name", [*TRIED.split(), *(pytest.param(name, marks=pytest.mark.needs_compiler) for name in COMPILED)]
+)
+def test_no_hostile_folder_reaches_anything(
+    name: str, arena: Arena, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "secret.json").write_text('{"secret": 42.0}')
-    folder = tmp_path / "runs"
-    write_run(folder / "0", {"seed": 1}, {"ball_error": 0.125})
-    (folder / "1").mkdir()
-    TABLES[name](folder / "1")
-    (folder / "1" / "²").mkdir(exist_ok=True)
-    write_run(folder / "2", {"seed": 2}, {"ball_error": 0.25})
-    for line in ([], ["--format", "csv"]):
-        assert main([str(folder), *line]) == 0
-        out, err = capsys.readouterr()
-        assert "0.125" in out
-        assert "0.25" in out
-        assert "42.0" not in out
-        assert not set(out + err) & {"\x1b", "\x07", "\x00"}
+    (command, *words), check = ATTACKS[name](arena)
+    before = attacks.snapshot(arena.root, (arena.hostile, arena.cwd))
+    try:
+        code, said = MAINS[command](words) or 0, ""
+    except SystemExit as ended:
+        code, said = 1, str(ended)
+    result = attacks.Outcome(code, "".join((*capfd.readouterr(), said)), 0.0, 0, waited=False)
+    assert attacks.verdict(arena, before, result, result, check, large=False) == []
 
 
-class Tags(HTMLParser):
-    """Collect the tags of a page, without those of a table."""
+def test_trust_builds_what_the_settings_name(arena: Arena) -> None:
+    ATTACKS["target_through_a_module_of_ours"](arena)
+    with pytest.raises(ValueError, match=r"\w"):
+        deployable(arena.one)
+    assert not (arena.victim / "PWNED").exists()
+    with pytest.raises(ValueError, match=r"\w"):
+        deployable(arena.one, trust=True)  # runs, and finds no kernel
+    assert (arena.victim / "PWNED").exists()
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.found: list[str] = []
 
-    def handle_starttag(self, tag: str, attrs: object) -> None:
-        self.found += [tag] * (tag not in ("table", "thead", "tbody", "tr", "th", "td", "b", "p"))
+@pytest.mark.parametrize("kind", ["pipe", "link", "text"])
+def test_a_history_that_is_no_archive_is_refused_and_not_waited_for(kind: str, arena: Arena) -> None:
+    history = arena.one / "history.npz"
+    history.rename(arena.cwd / "elsewhere.npz")
+    if kind == "pipe":
+        os.mkfifo(history)
+    elif kind == "link":
+        history.symlink_to(arena.cwd / "elsewhere.npz")
+    else:
+        history.write_bytes(b"PK\x05\x06")
+    with pytest.raises(ValueError, match="history"):
+        deployable(arena.one)
+
+
+CELLS = {  # texts of settings that must arrive as texts in every format
+    "formula": "=cmd|' /C calc'!A0",
+    "plus": "+1+cmd",
+    "at": "@SUM(A1)",
+    "tag": "<script>alert(1)</script>",
+    "escaped tag": r"`a\<img src=x onerror=alert(1)>`\<img src=x>",
+    "image": "![x](http://evil.example/pixel.png)",
+    "reference": "[x]: http://evil.example/ 'y'",
+    "code": "``<img src=http://evil.example/x>``",
+    "backquotes": "` `` <b> `` `",
+    "input": r"\input{/etc/passwd}",
+    "bar": "a|b|c",
+    "direction": "abc\u202egnp.exe",
+    "terminal": "\x1b]0;owned\x07\x1b[31m",
+}
 
 
 @pytest.mark.parametrize("name", CELLS)
@@ -73,43 +127,14 @@ def test_texts_arrive_as_texts_in_every_format(name: str, tmp_path: Path) -> Non
         json.dumps(nasty[:3] if name != "terminal" else r"\u0")
     )
     assert not row["kernel"].startswith(("=", "+", "-", "@", "\t"))
-    tags = Tags()
-    tags.feed(html_text(table))
-    assert tags.found == []
+    tags = set(re.findall(r"<(\w+)", html_text(table)))
+    assert tags <= {"table", "thead", "tbody", "tr", "th", "td", "b", "p"}
     assert r"\input" not in latex_text(table)
     text = table.markdown()
     assert not set(text) & {"\x1b", "\x07", "\u202e"}
-    assert rendered(text) == [], text
+    # Behind an odd number of backslashes nothing is a tag, a link or an image, in a code span or not.
+    assert re.findall(r"(?<!\\)(?:\\\\)*(?:<|\]\(|\]:|\]\[)", text) == [], text
     assert len({line.replace(r"\|", "").count("|") for line in text.splitlines() if line[:1] == "|"}) == 1
-
-
-def rendered(markdown: str) -> list[str]:
-    """Tags, links and images that a reader of Markdown would see, by CommonMark's rules for one line each."""
-    found = []
-    for line in markdown.splitlines():
-        at = 0
-        while at < len(line):
-            if line[at] == "\\":
-                at += 2
-                continue
-            if line[at] == "`":
-                run = len(line[at:]) - len(line[at:].lstrip("`"))
-                close = next(
-                    (
-                        k
-                        for k in range(at + run, len(line))
-                        if line[k : k + run] == "`" * run
-                        and line[k - 1] != "`"
-                        and line[k + run : k + run + 1] != "`"
-                    ),
-                    None,
-                )
-                at = at + run if close is None else close + run
-                continue
-            if line[at] == "<" or line[at : at + 2] in ("](", "]:", "]["):
-                found.append(line[at:])
-            at += 1
-    return found
 
 
 def test_the_command_writes_a_table_through_no_link(tmp_path: Path) -> None:
@@ -129,7 +154,7 @@ def test_no_name_of_a_folder_reaches_the_terminal_as_it_is(
     for number, name in enumerate(("0", "\x1b[2J\u202e", "\x1b]0;x\x07")):
         write_run(tmp_path / name, {"seed": number}, {"ball_error": 0.1 * number}, version=f"0.0.{number}")
     (tmp_path / "\x1b]0;x\x07" / "run.json").write_text("{")
-    for line in ([], ["--rows", "seed"], ["--format", "csv"]):
+    for line in ([], ["--format", "csv"]):
         assert main([str(tmp_path), *line]) == 0
         said = "".join(capsys.readouterr())
         assert not set(said) & {"\x1b", "\x07", "\u202e"}
@@ -142,75 +167,7 @@ def test_no_space_hides_a_formula_from_the_table_and_none_is_computed(tmp_path: 
     assert [row["kernel"][0] for row in rows] == ["'", "'", "'", "p"]
 
 
-@pytest.mark.parametrize("setting", [[1e999], [1.0, [-1e999]], "[1e999]"])
-def test_a_number_in_a_list_that_is_none_costs_no_table(setting: object, tmp_path: Path) -> None:
-    for number, value in enumerate(([1.0], setting)):
+def test_a_number_in_a_list_that_is_none_costs_no_table(tmp_path: Path) -> None:
+    for number, value in enumerate(([1.0], [1e999], [1.0, [-1e999]], "[1e999]")):
         write_run(tmp_path / str(number), {"initial_state": value}, {"ball_error": 0.125})
-    assert json_text(tabulate(collect(tmp_path))).count("0.125") == 2
-
-
-# `staf-export`
-
-
-class Evil:
-    """Leaves a file when it is unpickled."""
-
-    def __init__(self, victim: Path) -> None:
-        self.victim = victim
-
-    def __reduce__(self) -> Any:
-        return Path.touch, (self.victim,)
-
-
-@pytest.fixture(scope="module")
-def chase(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    run = tmp_path_factory.mktemp("runs") / "chase"
-    cfg = settings("centers.count=6", "duration=0.1", "trajectories=2", "figures=false")
-    (run / ".hydra").mkdir(parents=True)
-    OmegaConf.save(cfg, run / ".hydra" / "config.yaml")
-    experiment(cfg.task)(cfg, run)
-    return run
-
-
-@pytest.fixture
-def run(chase: Path, tmp_path: Path) -> Path:
-    torch.save(Evil(tmp_path / "owned"), tmp_path / "evil.pt", pickle_module=pickle)
-    return Path(shutil.copytree(chase, tmp_path / "run"))
-
-
-@pytest.mark.parametrize("name", EXPORTS)
-def test_a_hostile_run_is_refused_in_a_sentence(name: str, run: Path, tmp_path: Path) -> None:
-    EXPORTS[name](run)
-    with pytest.raises(ValueError, match=r"\w") as refused:
-        deployable(run)
-    assert not (tmp_path / "owned").exists()
-    assert "Error" not in str(refused.value).partition("(")[0]
-
-
-def test_the_file_that_would_be_unpickled_does_harm(run: Path, tmp_path: Path) -> None:
-    torch.load(tmp_path / "evil.pt", weights_only=False)
-    assert (tmp_path / "owned").exists()
-
-
-@pytest.mark.parametrize("name", ["a target", "a target in the decoded text of another key"])
-def test_trust_builds_what_the_settings_name(name: str, run: Path, tmp_path: Path) -> None:
-    if HAS_WHITELIST and "decoded" in name:
-        pytest.skip("Hydra 1.4.0rc3 cannot copy a node that an interpolation makes")
-    EXPORTS[name](run)
-    with pytest.raises(ValueError, match=r"\w"):
-        deployable(run, trust=True)  # runs, and finds no kernel
-    assert (tmp_path / "owned").exists()
-
-
-@pytest.mark.needs_compiler
-def test_the_name_of_a_folder_is_neither_c_nor_told_to_the_terminal(run: Path, tmp_path: Path) -> None:
-    evil = "__attribute__((constructor)) static void evil(void)"
-    (tmp_path / "x").write_text(
-        f'int system(const char *); {evil} {{ system("touch {tmp_path}/owned"); }}\nvoid staf() {{}}\n'
-    )
-    moved = tmp_path / 'x"\n#pragma \x1b[2J'
-    run.rename(moved)
-    page = data_sheet.markdown(export(moved, "c", calls=10))
-    assert not (tmp_path / "owned").exists()
-    assert "\x1b" not in page
-    assert "pragma" in page
+    assert json_text(tabulate(collect(tmp_path))).count("0.125") == 4

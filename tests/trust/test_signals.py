@@ -18,7 +18,7 @@ SIGNALLED = '''
 import os, random, signal, sys, time
 import staf_torch.cli.staf as app
 
-GRID = ["centers.count=3,4,6", "centers.radius=0.1,0.2", "hydra.launcher.batch=1"]
+GRID = ["centers.count=3,4", "centers.radius=0.1,0.2", "hydra.launcher.batch=1"]
 GRID += ["duration=0.02", "settle_time=0", "figures=false", "history=false"]
 
 def run(place, *argv):
@@ -72,10 +72,10 @@ codes = {"whole": ended(start("whole", *GRID, "hydra.sweep.dir=whole"))}
 whole = time.monotonic() - begin
 codes["runs"] = [ended(killed_before_a_name(survived)) for survived in range(5)]
 chance = random.Random(3)
-for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
+for number in (signal.SIGTERM, signal.SIGINT):
     place = number.name
     child = start(place, *GRID, f"hydra.sweep.dir={place}")
-    jobs = chance.randint(1, 3)
+    jobs = chance.randint(0, 1)
     while not os.path.exists(f"{place}/{jobs}/run.json"):
         time.sleep(0.002)
     os.kill(child, number)
@@ -115,11 +115,7 @@ def ended_and_resumed(folder: Path) -> object:
 def test_signals_end_a_sweep_with_its_report_and_the_line_that_resumes(place: Path) -> None:
     codes = json.loads((place / "codes.json").read_text())
     assert codes["whole"] == 1  # two jobs have a count that there is not
-    for name, code, said in (
-        ("SIGTERM", 143, "ended by SIGTERM"),
-        ("SIGHUP", 129, "ended by SIGHUP"),
-        ("SIGINT", 130, "interrupted"),
-    ):
+    for name, code, said in (("SIGTERM", 143, "ended by SIGTERM"), ("SIGINT", 130, "interrupted")):
         log = (place / f"{name}.log").read_text()
         assert codes[name] == code, log
         assert f"staf: {said}" in log
@@ -131,7 +127,7 @@ def test_signals_end_a_sweep_with_its_report_and_the_line_that_resumes(place: Pa
 
 def test_a_sweep_killed_at_a_random_time_ends_as_if_it_had_not_been(place: Path) -> None:
     expected = rows(place / "whole")
-    assert len(expected) == 6
+    assert len(expected) == 4
     assert sum(isinstance(row, str) for row in expected.values()) == 2
     assert rows(place / "killed") == expected
 
@@ -236,13 +232,6 @@ def test_a_directory_that_is_removed_ends_its_sweep(tmp_path: Path) -> None:
     assert code == 1
     assert "sweep was removed or replaced while its sweep went on" in err
     assert "completed" not in out
-
-
-def test_a_job_that_is_removed_is_no_completed_one(tmp_path: Path) -> None:
-    code, out, err = harmed(tmp_path, "shutil.rmtree('sweep/0')")
-    assert code == 1
-    assert "are not in sweep/0 any more" in err
-    assert "2 of 3 jobs completed, 1 failed" in out
 
 
 def test_a_disk_that_takes_no_file_fails_what_it_hits_and_resume_ends_the_sweep(tmp_path: Path) -> None:
