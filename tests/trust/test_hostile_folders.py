@@ -32,9 +32,9 @@ metric_tracker_and_predictor text_where_a_number_belongs the_environment_in_a_se
 a_history_whose_header_is_a_program an_environment_whose_id_names_a_module a_secret_as_a_model_of_mujoco
 slopes_that_are_a_call a_plant_within_a_barrier keys_merged_into_a_target interpolations_that_double
 controls_beyond_escape controls_in_the_name_of_a_job formulas_of_every_kind tex_in_caret_notation
-links_and_scripts_in_markdown a_loop_of_links files_that_are_no_files
-rows_of_every_type numbers_of_every_type_for_jobs a_table_written_over_its_source
-"""  # by `staf-table` and `staf-export`, without those that take memory or a second
+links_and_scripts_in_markdown a_loop_of_links files_that_are_no_files rows_of_every_type
+numbers_of_every_type_for_jobs a_table_written_over_its_source
+"""  # by `staf-table` and `staf-export`, without those that take memory or time, or cannot be removed
 
 
 @pytest.fixture(scope="module")

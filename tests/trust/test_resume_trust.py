@@ -77,21 +77,26 @@ def edit(path: Path, before: str, after: str) -> None:
     path.write_text(text.replace(before, after))
 
 
-def test_what_changed_between_start_and_resume_is_told(place: Path) -> None:
-    edit(place / "conf/experiment/mine.yaml", "0.5", "2.5")
-    edit(place / "bowls.py", "SCALE *", "2 * SCALE *")
-    edit(place / "bowl_helper.py", "1.0", "3.0")
-    path = place / "sweep" / "0" / "run.json"
-    about = json.loads(path.read_text())
-    about["build"] |= {"source": "0", "torch": "0"}
-    path.write_text(json.dumps(about | {"checksum": build.record_checksum(about)}))
+CHANGED = {
+    "files": ["spread was 0.5 and is now 2.5", "module bowls has changed", "module bowl_helper has changed"],
+    "build": ["the source of staf_torch was 0", "torch was 0"],
+}
+
+
+@pytest.mark.parametrize("what", CHANGED)
+def test_what_changed_between_start_and_resume_is_told(what: str, place: Path) -> None:
+    if what == "files":
+        edit(place / "conf/experiment/mine.yaml", "0.5", "2.5")
+        edit(place / "bowls.py", "SCALE *", "2 * SCALE *")
+        edit(place / "bowl_helper.py", "1.0", "3.0")
+    else:
+        path = place / "sweep" / "1" / "run.json"
+        about = json.loads(path.read_text())
+        about["build"] |= {"source": "0", "torch": "0"}
+        path.write_text(json.dumps(about | {"checksum": build.record_checksum(about)}))
     code, _, err = resume(place)
     assert code == 1
-    for said in (
-        "spread was 0.5 and is now 2.5",
-        *("the module bowls has changed", "the module bowl_helper has changed"),
-        *("the source of staf_torch was 0", "torch was 0", "sweep.resume_anyway=true"),
-    ):
+    for said in (*CHANGED[what], "sweep.resume_anyway=true"):
         assert said in err
     assert not (place / "sweep" / "2").exists()
 
