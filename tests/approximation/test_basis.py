@@ -10,16 +10,12 @@ import mpmath
 import pytest
 import torch
 from helpers import basis_of, centers_of, tensor, uniform
-from hypothesis import given, settings
-from hypothesis import strategies as some
 from variants import KERNELS, RADII, TARGETS, by_turns, directions_of, over
 
 import staf_torch as st
 from staf_torch.approximation import conditioning
 from staf_torch.centers import probe_points
-from staf_torch.targets import Cosine, Paper, Quadratic
-
-SEEDS = some.integers(0, 2**31)
+from staf_torch.targets import Cosine, Paper
 
 
 @pytest.mark.parametrize(("name", "batch"), by_turns(KERNELS, [(), (2, 3)]))
@@ -47,12 +43,14 @@ MADE = {
     **{name: make for name, (make, _) in RADII.items()},
     "as_good_as_constant": lambda: st.StateRadius(0.3, 0.5, 2.0),
 }
-PLACES = [(name, radius) for name in OWN for radius in MADE]
 
 
 @pytest.mark.parametrize(
     ("name", "radius", "layout"),
-    [(*place, ("rings6", "polygon1", "ball_of_one")[k % 3]) for k, place in enumerate(PLACES)],
+    [
+        (name, radius, ("rings6", "polygon1", "ball_of_one")[k % 3])
+        for k, (name, radius) in enumerate(by_turns([*OWN] * 2, ["as_good_as_constant", *RADII]))
+    ],
 )
 def test_a_basis_that_is_the_same_at_every_state_says_so_once(name: str, radius: str, layout: str) -> None:
     basis = st.StaFBasis(OWN[name](), st.StateFollowingCenters(directions_of(layout), MADE[radius]()))
@@ -77,29 +75,23 @@ def test_a_basis_that_is_the_same_at_every_state_says_so_once(name: str, radius:
 
 
 @over(KERNELS)
-@pytest.mark.parametrize("radius", [0.3, st.StateRadius(0.5, 0.1)])
-def test_gram_structure_multiplies_to_the_gram_matrix(name: str, radius: object) -> None:
-    basis = basis_of(name, radius=radius)
+def test_gram_structure_multiplies_to_the_gram_matrix_and_one_core_serves_all_states_where_it_can(
+    name: str,
+) -> None:
     x = uniform(3, 4, 2)
-    structure = basis.gram_structure(x)
-    gain = torch.zeros(3, 4).double() if structure.log_gain is None else structure.log_gain
-    gram = structure.scaled() * gain.exp()[..., None, None]
-    torch.testing.assert_close(gram.expand(3, 4, 6, 6), basis.gram(x), rtol=1e-12, atol=1e-14)
-
-
-@over(KERNELS)
-def test_one_core_serves_all_states_where_kernel_and_radius_allow(name: str) -> None:
-    constant, moving = basis_of(name), basis_of(name, radius=st.StateRadius(0.5, 0.1))
-    x = uniform(5, 2)
-    shared = constant.kernel.state_free
-    assert constant.gram_structure(x).core.shape == ((6, 6) if shared else (5, 6, 6))
-    assert moving.gram_structure(x).core.shape == (5, 6, 6)
+    for radius in (0.3, st.StateRadius(0.5, 0.1)):
+        basis = basis_of(name, radius=radius)
+        structure = basis.gram_structure(x)
+        gain = torch.zeros(3, 4).double() if structure.log_gain is None else structure.log_gain
+        gram = structure.scaled() * gain.exp()[..., None, None]
+        torch.testing.assert_close(gram.expand(3, 4, 6, 6), basis.gram(x), rtol=1e-12, atol=1e-14)
+        shared = radius == 0.3 and basis.kernel.state_free
+        assert structure.core.shape == ((6, 6) if shared else (3, 4, 6, 6))
 
 
 @pytest.mark.parametrize(("name", "target"), by_turns(KERNELS, list(TARGETS)))
-@pytest.mark.parametrize("radius", [0.8, st.StateRadius(1.5, 0.3)])
-def test_ideal_weights_interpolate_at_the_centers(name: str, target: str, radius: object) -> None:
-    basis, function = basis_of(name, radius=radius), TARGETS[target][0]()
+def test_ideal_weights_interpolate_at_the_centers(name: str, target: str) -> None:
+    basis, function = basis_of(name, radius=st.StateRadius(1.5, 0.3)), TARGETS[target][0]()
     x = uniform(5, 2, low=0.4, high=1.2)
     weights = basis.ideal_weights(x, function)
     assert weights.shape == (5, 6)
@@ -120,11 +112,9 @@ def test_ideal_weights_are_those_of_fifty_digits(name: str) -> None:
 
 
 @over(KERNELS)
-@settings(max_examples=3)
-@given(seed=SEEDS)
-def test_ideal_weights_minimise_the_native_error(name: str, seed: int) -> None:
+def test_ideal_weights_minimise_the_native_error(name: str) -> None:
     basis = basis_of(name, radius=0.7)
-    x, step = uniform(2, low=0.3, seed=seed), uniform(6, seed=seed + 1)
+    x, step = uniform(2, low=0.3), uniform(6)
     ideal = basis.ideal_weights(x, Paper())
     lengths = tensor([0.5, 1.0, 2.0, 4.0])
     excess = basis.excess(ideal + lengths[:, None] * step, x.expand(4, 2), Paper())
@@ -210,11 +200,6 @@ class _WrongShape(torch.nn.Module):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: st.StaFBasis("k", centers_of()), "`StaFBasis(kernel=...)` must be a Kernel; got 'k'."),
-        (lambda: st.StaFBasis(st.GaussianKernel(), 3), "`StaFBasis(centers=...)` must be a StateFollowing"),
-        (lambda: basis_of("gaussian")(uniform(2), uniform(2)), "(y=...)` must have at least 2 dimensions"),
-        (lambda: basis_of("gaussian")(uniform(4, 3), uniform(2)), "must have 2 entries in its last dim"),
-        (lambda: basis_of("gaussian").local(uniform(3)), "`StaFBasis.local(x=...)` must have 2 entries"),
         (
             lambda: basis_of("gaussian").ideal_weights(uniform(2), _WrongShape()),
             "The target `_WrongShape` must map points of shape (..., n) to values of shape (...): "
@@ -223,10 +208,6 @@ class _WrongShape(torch.nn.Module):
         (
             lambda: basis_of("gaussian").ideal_weights(uniform(2), lambda y: 1.0),
             "The target `<lambda>` must return a tensor; got 1.0.",
-        ),
-        (
-            lambda: basis_of("gaussian").ideal_weights(uniform(3), Quadratic()),
-            "must have 2 entries in its last",
         ),
     ],
 )
@@ -246,10 +227,7 @@ def test_condition_numbers_are_those_of_the_matrices(name: str) -> None:
     whole, core = torch.linalg.cond(structure.scaled()).expand(4), structure.core
     torch.testing.assert_close(found.condition, whole, rtol=1e-6, atol=0)
     torch.testing.assert_close(found.core_condition, torch.linalg.cond(core), rtol=1e-6, atol=0)
-    assert found.condition.shape == (4,)
-    for shape in ((), (2, 3)):
-        many = conditioning.conditioning(basis, uniform(*shape, 2, low=0.3))
-        assert many.condition.shape == shape
+    assert conditioning.conditioning(basis, uniform(2, 3, 2, low=0.3)).condition.shape == (2, 3)
     assert bool((found.rank == 6).all())
     assert bool((found.effective_rank == 6).all())
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import io
 import math
 import pickle
 
@@ -62,6 +61,7 @@ def test_value_and_gradient_are_those_of_autograd(name: str, radius: str) -> Non
     staf = st.StaF(basis_of(name, radius=FIXED_RADII[radius][0]()), (3,)).fit_(x, Paper())
     y = (x.unsqueeze(-2) + uniform(3, 4, 2, low=-3.0, high=3.0)).requires_grad_()  # also far outside the ball
     values, gradient = staf.value_and_gradient(y)
+    assert torch.equal(staf.gradient(y), gradient)
     torch.testing.assert_close(values, staf(y), rtol=1e-13, atol=0)
     (expected,) = torch.autograd.grad(staf(y).sum(), y)
     scale = float(expected.abs().max())
@@ -108,9 +108,8 @@ def test_gradients_reach_everything_that_is_learned_in_every_mode(name: str, rad
         assert torch.autograd.gradcheck(function, inputs, atol=1e-5, rtol=1e-4, fast_mode=True), mode
 
 
-@pytest.mark.parametrize("name", ["exponential", "matern52"])
-def test_second_derivatives_are_right(name: str) -> None:
-    staf, y = learnable(name, "shrinking")
+def test_second_derivatives_are_right() -> None:
+    staf, y = learnable("exponential", "shrinking")
     function, at = as_function(staf, "value", Paper())
     assert torch.autograd.gradgradcheck(
         function, (y.requires_grad_(), *at), atol=1e-4, rtol=1e-3, fast_mode=True
@@ -126,33 +125,6 @@ def test_the_basis_turns_smoothly_with_its_directions() -> None:
         torch.testing.assert_close(staf(y).detach(), before, rtol=1e-6, atol=1e-6)
 
 
-def test_trained_hyperparameters_travel_with_the_state_dict() -> None:
-    staf, y = learnable("gaussian", "shrinking", (2,))
-    optimizer = torch.optim.Adam(staf.parameters(), lr=0.02)
-    start = float((staf(y) - 1).square().mean().detach())
-    for _ in range(20):
-        optimizer.zero_grad()
-        loss = (staf(y) - 1).square().mean()
-        loss.backward()
-        optimizer.step()
-    assert float(loss.detach()) < 0.5 * start
-    fresh = learnable("gaussian", "shrinking", (2,))[0]
-    fresh.load_state_dict(staf.state_dict())
-    assert torch.equal(fresh(y), staf(y))
-    assert float(fresh.basis.kernel.width.detach()) != 0.8
-
-
-def test_directions_swapped_in_are_used() -> None:
-    staf = fixed("exponential")
-    other = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(st.ball(6, 2), 0.5))
-    y = staf.state + uniform(3, 2, low=-0.1, high=0.1)
-    swapped = {"basis.centers.directions": st.ball(6, 2)}
-    found = torch.func.functional_call(staf, swapped, (y,))
-    expected = other.local(staf.state).evaluate(y - staf.state, staf.coefficients)
-    # The units of length differ: 1 to rounding for both layouts.
-    torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
-
-
 @pytest.mark.filterwarnings("ignore:.*torch.jit.script:DeprecationWarning")  # torch's own, in jacfwd
 @over(FIXED)
 def test_function_transforms_agree_with_the_batch(name: str) -> None:
@@ -166,9 +138,8 @@ def test_function_transforms_agree_with_the_batch(name: str) -> None:
         torch.testing.assert_close(hessian, staf.hessian(y), rtol=1e-7, atol=1e-7)
 
 
-@pytest.mark.parametrize("name", ["gaussian", "matern52", "polynomial"])
-def test_an_ensemble_is_called_by_vmap(name: str) -> None:
-    members = [learnable(name, "constant")[0] for _ in range(3)]
+def test_an_ensemble_is_called_by_vmap() -> None:
+    members = [learnable("matern52", "constant")[0] for _ in range(3)]
     for k, member in enumerate(members):
         with torch.no_grad():
             member.basis.centers.directions *= 1 - 0.1 * k
@@ -258,37 +229,14 @@ def test_modules_of_one_parametrisation_share_their_programs() -> None:
     assert Contents(_parametrised(0.8)).key == Contents(_parametrised(0.5)).key is not None
 
 
-@over(FIXED)
-def test_copies_are_the_same_function_and_apart(name: str) -> None:
-    staf = fixed(name, (2,)).fit_(uniform(2, 2, low=0.3), lambda y: Paper()(y))
+def test_a_copy_keeps_the_target_and_a_pickle_leaves_one_behind_that_has_no_name() -> None:
+    staf = fixed("gaussian", (2,)).fit_(uniform(2, 2, low=0.3), lambda y: Paper()(y))
     y = staf.state.unsqueeze(-2) + uniform(2, 3, 2, low=-0.2, high=0.2)
-    before = staf(y).detach()
-    saved = io.BytesIO()
-    if name != "user_defined":
-        torch.save(staf, saved)
-        saved.seek(0)
-        assert torch.equal(torch.load(saved, weights_only=False)(y), before)
     copied, pickled = copy.deepcopy(staf), pickle.loads(pickle.dumps(staf))
     assert torch.equal(copied.gradient(y, "total"), staf.gradient(y, "total"))
-    with pytest.raises(ValueError, match="needs a target"):  # a lambda could not be pickled
+    with pytest.raises(ValueError, match="needs a target"):
         pickled.gradient(y, "total")
-    staf.reset_parameters()
-    assert not torch.isclose(staf(y), before).any()
-    assert torch.equal(copied(y), before)
-    assert torch.equal(pickled(y), before)
-
-
-@over(FIXED)
-def test_precision_is_changed_and_changed_back(name: str) -> None:
-    staf = fixed(name, (2,))
-    y = staf.state.unsqueeze(-2) + uniform(2, 3, 2, low=-0.2, high=0.2)
-    expected = staf(y).detach()
-    staf.float()
-    assert staf(y.float()).dtype == staf.gradient(y.float()).dtype == torch.float32
-    torch.testing.assert_close(staf(y.float()).double(), expected, rtol=1e-2, atol=1e-2)
-    staf.to(torch.float64)
-    centers = staf.fit_(staf.state.clone(), Paper()).basis.centers(staf.state)
-    torch.testing.assert_close(staf(centers), Paper()(centers), rtol=1e-9, atol=1e-9)
+    assert torch.equal(pickled(y), staf(y))
 
 
 @pytest.mark.parametrize("name", ["exponential", "matern52", "polynomial"])
@@ -332,22 +280,9 @@ def test_distributed_data_parallel_trains_a_layer() -> None:
         dist.destroy_process_group()
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: st.StaF(3), r"`StaF\(basis=...\)` must be a StaFBasis; got 3."),
-        (lambda: st.StaF(basis_of("gaussian"), out_features=0), r"out_features=...\)` must be at least 1"),
-        (lambda: st.StaF(basis_of("gaussian"), learnable=1), r"learnable=...\)` must be true or false"),
-        (
-            lambda: st.StaF(basis_of("gaussian"), (), 2).fit_(uniform(2), Paper()),
-            r"values of shape \(..., 2\): \(6, 2\) must give \(6, 2\); got \(6,\)",
-        ),
-        (lambda: st.GaussianKernel(learned(-1.0)), r"`GaussianKernel\(width=...\)` must be positive"),
-    ],
-)
-def test_a_bad_argument_is_named_with_its_value(make, message: str) -> None:  # type: ignore[no-untyped-def]
-    with pytest.raises(ValueError, match=message):
-        make()
+def test_a_target_of_another_number_of_outputs_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"\(6, 2\) must give \(6, 2\); got \(6,\)"):
+        st.StaF(basis_of("gaussian"), (), 2).fit_(uniform(2), Paper())
 
 
 def test_points_of_another_batch_are_refused_with_both_numbers() -> None:

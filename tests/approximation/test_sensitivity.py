@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import mpmath as mp
 import pytest
 import torch
 from helpers import basis_of, tensor, uniform
 from torch import Tensor, nn
-from variants import KERNELS, RADII, by_turns, over
+from variants import KERNELS, RADII, by_turns
 
 import staf_torch as st
 from staf_torch.approximation.sensitivity import state_jacobian, weight_jacobian
-
-SMOOTH = [name for name, case in KERNELS.items() if case.derivatives >= 2]
 
 
 def smooth_target(x: Tensor) -> Tensor:
@@ -44,8 +40,7 @@ def assert_close(found: Tensor, expected: Tensor, tolerance: float) -> None:
     assert float((found - expected).abs().max()) <= tolerance * float(expected.abs().max())
 
 
-@over(KERNELS, "kernel")
-@pytest.mark.parametrize("count", [3, 6])
+@pytest.mark.parametrize(("kernel", "count"), by_turns(KERNELS, [3, 6]))
 def test_weight_jacobian_is_what_differences_of_the_dense_solution_give(kernel: str, count: int) -> None:
     basis = basis_of(kernel, count, radius=0.6)
     x = uniform(2, 2, seed=count) + 0.4
@@ -55,9 +50,7 @@ def test_weight_jacobian_is_what_differences_of_the_dense_solution_give(kernel: 
         assert_close(row, central_differences(basis, basis.centers(at), 1e-3), 1e-6)
 
 
-@pytest.mark.parametrize(
-    ("kernel", "radius"), [*by_turns(KERNELS, list(RADII)), *by_turns(KERNELS, list(RADII)[::-1])]
-)
+@pytest.mark.parametrize(("kernel", "radius"), by_turns(KERNELS, list(RADII)))
 def test_state_jacobian_is_that_of_the_ideal_weights(kernel: str, radius: str) -> None:
     basis = basis_of(kernel, 3, RADII[radius][0]())
     x = uniform(3, 2, seed=5) + tensor([0.9, 0.2])
@@ -68,13 +61,6 @@ def test_state_jacobian_is_that_of_the_ideal_weights(kernel: str, radius: str) -
         assert_close(row, expected, 1e-7)
 
 
-@pytest.mark.parametrize("function", [weight_jacobian, state_jacobian])
-def test_states_of_another_space_are_refused(function: Callable[..., torch.Tensor]) -> None:
-    for shape in ((3,), (4, 3), (4, 1)):
-        with pytest.raises(ValueError, match=rf"`{function.__name__}\(x=...\)` must "):
-            function(basis_of("gaussian", 3), uniform(*shape), smooth_target)
-
-
 def test_state_jacobian_is_the_weight_jacobian_along_the_moving_centers() -> None:
     basis = basis_of("gaussian", 6, st.StateRadius(0.7, 0.1, gain=2.0))
     x = uniform(4, 2, seed=2)
@@ -83,11 +69,10 @@ def test_state_jacobian_is_the_weight_jacobian_along_the_moving_centers() -> Non
     assert_close(state_jacobian(basis, x, smooth_target), expected, 1e-11)
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_batch_and_vmap_are_one_state_at_a_time(seed: int) -> None:
-    kernel = ["exponential", "gaussian", "matern52", "polynomial"][seed]
-    basis = basis_of(kernel, 6, st.StateRadius(0.7, 0.3))
-    x = uniform(2, 3, 2, seed=seed)
+@pytest.mark.parametrize("kernel", ["gaussian", "polynomial"])
+def test_batch_and_vmap_are_one_state_at_a_time(kernel: str) -> None:
+    basis = basis_of(kernel, 3, st.StateRadius(0.7, 0.3))
+    x = uniform(2, 2, 2, seed=1)
     for function in (weight_jacobian, state_jacobian):
         together = function(basis, x, smooth_target)
         alone = torch.stack([function(basis, at, smooth_target) for at in x.flatten(0, 1)])
@@ -96,7 +81,7 @@ def test_batch_and_vmap_are_one_state_at_a_time(seed: int) -> None:
         assert_close(mapped, together, 1e-9)
 
 
-@pytest.mark.parametrize("kernel", SMOOTH)
+@pytest.mark.parametrize("kernel", ["exponential", "matern52", "polynomial"])
 def test_jacobians_can_be_differentiated_again(kernel: str) -> None:
     basis = basis_of(kernel, 3, st.StateRadius(0.7, 0.5))
     x = (uniform(2, 2, seed=3) + 0.7).requires_grad_()

@@ -9,15 +9,12 @@ import pytest
 import torch
 from helpers import tensor, uniform
 from torch.autograd import gradcheck, gradgradcheck
-from variants import KERNELS, SMOOTH_KERNELS, over
+from variants import KERNELS, SMOOTH_KERNELS, by_turns, over
 
 import staf_torch as st
 
-SHAPES = ((), (4,), (2, 3))
 
-
-@over(KERNELS)
-@pytest.mark.parametrize("dim", [1, 2, 5])
+@pytest.mark.parametrize(("name", "dim"), by_turns(KERNELS, [1, 2, 5]))
 def test_kernel_equals_its_formula(name: str, dim: int) -> None:
     case = KERNELS[name]
     y, c = uniform(6, dim), uniform(5, dim)
@@ -32,8 +29,7 @@ def test_kernel_is_symmetric(name: str) -> None:
     torch.testing.assert_close(kernel(y, c), kernel(c, y).mT, rtol=1e-14, atol=0)
 
 
-@over(KERNELS)
-@pytest.mark.parametrize("dim", [2, 4])
+@pytest.mark.parametrize(("name", "dim"), by_turns(KERNELS, [2, 4]))
 def test_gram_matrix_of_distinct_points_is_positive_definite(name: str, dim: int) -> None:
     points = uniform(20, 6, dim, low=-1.5, high=1.5)
     gram = KERNELS[name].make()(points, points)
@@ -41,8 +37,7 @@ def test_gram_matrix_of_distinct_points_is_positive_definite(name: str, dim: int
     assert (eigenvalues[:, 0] > 1e-12 * eigenvalues[:, -1]).all()
 
 
-@over(KERNELS)
-@pytest.mark.parametrize("batch", SHAPES)
+@pytest.mark.parametrize(("name", "batch"), by_turns(KERNELS, [(), (2, 3)]))
 def test_batch_equals_loop(name: str, batch: tuple[int, ...]) -> None:
     kernel = KERNELS[name].make()
     y, c = uniform(*batch, 4, 2), uniform(*batch, 3, 2)
@@ -53,21 +48,14 @@ def test_batch_equals_loop(name: str, batch: tuple[int, ...]) -> None:
 
 
 @over(KERNELS)
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_dtype_of_the_points_is_the_dtype_of_the_values(name: str, dtype: torch.dtype) -> None:
+def test_dtype_of_the_points_is_the_dtype_of_the_values(name: str) -> None:
     kernel = KERNELS[name].make()
     y, c = uniform(4, 2), uniform(3, 2)
-    exact, x = kernel(y, c), y[0]
-    got = kernel(y.to(dtype), c.to(dtype))
-    assert got.dtype == dtype
-    tolerance = 30 * torch.finfo(dtype).eps
+    exact, y, c = kernel(y, c), y.float(), c.float()
+    got, tolerance = kernel(y, c), 30 * torch.finfo(torch.float32).eps
     torch.testing.assert_close(got.double(), exact, rtol=tolerance, atol=tolerance)
-    for part in (
-        kernel.core(x.to(dtype), y.to(dtype), c.to(dtype)),
-        kernel.log_scale(x.to(dtype), y.to(dtype)),
-        kernel.log_gain(x.to(dtype)),
-    ):
-        assert part is None or part.dtype == dtype
+    for part in (got, kernel.core(y[0], y, c), kernel.log_scale(y[0], y), kernel.log_gain(y[0])):
+        assert part is None or part.dtype == torch.float32
 
 
 @over(KERNELS)
@@ -96,19 +84,12 @@ def test_exponent_rate_is_that_of_the_core(name: str) -> None:
         torch.testing.assert_close(kernel.core(z[0], z, d), (rate * z @ d.mT).exp(), rtol=1e-14, atol=0)
 
 
-@over(SMOOTH_KERNELS)
-def test_gradients_are_right(name: str) -> None:
-    kernel = KERNELS[name].make()
-    y, c = uniform(2, 3, 2).requires_grad_(), uniform(2, 2, 2).requires_grad_()
-    assert gradcheck(kernel, (y, c))
-    assert gradgradcheck(kernel, (y, c))
-
-
-def test_gradients_of_the_roughest_matern_kernel_are_right_away_from_the_center() -> None:
-    kernel = KERNELS["matern12"].make()
-    y, c = uniform(3, 2).requires_grad_(), (uniform(2, 2) + 4).requires_grad_()
-    assert gradcheck(kernel, (y, c))
-    assert gradgradcheck(kernel, (y, c))
+@over(KERNELS)
+def test_gradients_are_right_for_a_rough_kernel_away_from_its_center(name: str) -> None:
+    kernel, away = KERNELS[name].make(), 0.0 if name in SMOOTH_KERNELS else 4.0
+    y, c = uniform(3, 2).requires_grad_(), (uniform(2, 2) + away).requires_grad_()
+    assert gradcheck(kernel, (y, c), fast_mode=True)
+    assert gradgradcheck(kernel, (y, c), fast_mode=True)
 
 
 @over(KERNELS)
@@ -120,16 +101,13 @@ def test_gradient_at_coincident_points_is_finite(name: str) -> None:
 
 
 @pytest.mark.parametrize("smoothness", [1.5, 2.5])
-@pytest.mark.parametrize("dim", [1, 2, 4])
-def test_hessian_of_a_matern_kernel_at_its_center_is_minus_nu_over_nu_minus_one(
-    smoothness: float, dim: int
-) -> None:
+def test_hessian_of_a_matern_kernel_at_its_center_is_minus_nu_over_nu_minus_one(smoothness: float) -> None:
     length = 0.7
     kernel = st.MaternKernel(smoothness, length)
-    c = uniform(dim)
+    c = uniform(3)
     # Reverse mode twice: forward mode runs into a deprecation warning of torch itself.
     hessian = torch.func.jacrev(torch.func.jacrev(lambda at: kernel(at[None], c[None]).sum()))(c.clone())
-    expected = -smoothness / (smoothness - 1) / length**2 * torch.eye(dim, dtype=torch.float64)
+    expected = -smoothness / (smoothness - 1) / length**2 * torch.eye(3, dtype=torch.float64)
     torch.testing.assert_close(hessian, expected, rtol=1e-13, atol=1e-13)
 
 
@@ -215,8 +193,6 @@ def test_rational_quadratic_kernel_tends_to_the_gaussian() -> None:
     [
         (lambda: st.GaussianKernel(width=tensor([1.0, 0.0])), "must be positive; got [1.0, 0.0]."),
         (lambda: st.GaussianKernel(width=torch.tensor([1])), "must be a floating-point tensor; got [1]."),
-        (lambda: st.MaternKernel(smoothness=2.0), "(smoothness=...)` must be one of 0.5, 1.5, 2.5; got 2.0."),
-        (lambda: st.AnchoredKernel("k"), "`AnchoredKernel(kernel=...)` must be a Kernel; got str."),
         (lambda: st.AnchoredKernel(st.PolynomialKernel(2, 0.0)), "must have k(0, 0) > 0; got [0.0]"),
     ],
 )

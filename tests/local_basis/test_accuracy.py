@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 
 import mpmath as mp
 import pytest
@@ -12,8 +11,7 @@ from truth import LAYOUTS, RADII, Truth, ball_points, paper, smooth, smooth_targ
 
 import staf_torch as st
 from staf_torch.approximation.conditioning import lebesgue_constant
-from staf_torch.local_basis import GradedSpace, NewtonSpace, PolynomialSpace, phi
-from staf_torch.local_basis.graded import ridges
+from staf_torch.local_basis import NewtonSpace, PolynomialSpace, phi
 
 KERNELS = {"exponential": (st.ExponentialKernel, None), "gaussian": (lambda: st.GaussianKernel(0.8), 0.8)}
 
@@ -48,9 +46,9 @@ def single(staf: st.StaF) -> st.StaF:
         for n, layout in enumerate(LAYOUTS)
         for k, kernel in enumerate(KERNELS)
         for r, radius in enumerate(RADII)
-        # Every two of the three meet. The truth of 45 centers takes seconds: once each way there.
+        # The truth of 45 centers takes seconds: once each way there.
         if (
-            (n + k + r) % 2
+            (n + k + r) % 4 == 0
             if layout != "ball45_8"
             else (kernel, radius) in (("exponential", 0.5), ("gaussian", 1e-3))
         )
@@ -62,14 +60,14 @@ def test_value_is_exact_to_rounding_at_every_radius(layout: str, kernel: str, ra
     assert value_error(single(found[0]), *found[1:]) <= 5e-7
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(8))  # every dimension with both kernels
 def test_random_offsets_lose_no_more_than_their_lebesgue_constant(seed: int) -> None:
     generator = torch.Generator().manual_seed(seed)
     dim = 1 + seed % 4
     count = 2 + int(torch.randint(9, (), generator=generator))
     directions = ball_points(count, dim, generator)
     radius = float(10 ** (-8 * torch.rand((), generator=generator, dtype=torch.float64) - 0.3))
-    kernel = list(KERNELS)[seed % 2]
+    kernel = list(KERNELS)[seed // 4]
     found = problem(directions, kernel, radius, seed)
     constant = float(lebesgue_constant(found[0].basis, found[0].state))
     assert constant >= 0.9
@@ -84,7 +82,7 @@ def test_random_offsets_lose_no_more_than_their_lebesgue_constant(seed: int) -> 
         for n, layout in enumerate(("rings6", "rings15", "rings28", "ball15_4"))
         for k, kernel in enumerate(KERNELS)
         for r, radius in enumerate(RADII)
-        if (n + k + r) % 2
+        if (n + k + r) % 4 == 0
     ],
 )
 def test_gradient_is_exact_up_to_the_division_by_the_radius(layout: str, kernel: str, radius: float) -> None:
@@ -148,16 +146,6 @@ def test_a_sample_that_is_not_a_number_spoils_its_row_only() -> None:
     torch.testing.assert_close(spoiled[others], clean[others], rtol=1e-14, atol=1e-14)
 
 
-def test_wide_radius_is_inverted_row_by_row() -> None:
-    centers = st.StateFollowingCenters(st.rings(6), st.StateRadius(0.9, 0.1, 0.5))
-    basis = st.StaFBasis(st.GaussianKernel(0.4), centers)
-    x = torch.randn(7, 2, dtype=torch.float64)
-    at = basis.centers(x)
-    torch.testing.assert_close(
-        st.StaF(basis, (7,)).fit_(x, smooth_target)(at), smooth_target(at), rtol=1e-11, atol=1e-11
-    )
-
-
 def test_phi_functions_agree_with_their_series() -> None:
     t = torch.tensor(
         [-30.0, -4.0, -1.01, -1.0, -0.3, -1e-9, 0.0, 1e-3, 0.7, 1.0, 1.2, 9.0], dtype=torch.float64
@@ -175,52 +163,13 @@ def test_phi_functions_agree_with_their_series() -> None:
             assert abs(mp.mpf(float(value)) - exact) <= 4e-16 * loss * abs(exact) + 4e-16 * (loss > 1) * loss
 
 
-@pytest.mark.parametrize("r2", [0.0, 0.3, 2.0])
-def test_ridges_are_powers_times_the_tails_of_the_exponential(r2: float) -> None:
-    tau = torch.tensor([-0.9, 0.1, 0.8], dtype=torch.float64)
-    for k, found in enumerate(ridges(tau, torch.tensor(r2, dtype=torch.float64), 4)):
-        tail = sum((r2 * tau) ** j * (math.factorial(k) / math.factorial(k + j)) for j in range(40))
-        torch.testing.assert_close(found, tau**k * tail, rtol=1e-13, atol=1e-15)
-
-
 def test_directions_that_coincide_to_rounding_are_refused() -> None:
     u = torch.tensor([[0.5, 0.0], [0.5 + 1e-15, 0.0], [0.0, 1.0]], dtype=torch.float64)
     with pytest.raises(ValueError, match="must be told apart"):
         st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(u, 0.1))
 
 
-def test_loading_other_directions_sets_the_basis_up_again() -> None:
-    make = lambda u: st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(u, 0.1))  # noqa: E731
-    here, there = make(st.rings(6)), make(st.ball(6, 2))
-    here.load_state_dict(there.state_dict())
-    x = torch.tensor([0.4, 0.3], dtype=torch.float64)
-    assert torch.equal(here.ideal_weights(x, smooth_target), there.ideal_weights(x, smooth_target))
-
-
-@pytest.mark.filterwarnings("ignore:.*torch.jit.script:DeprecationWarning")  # torch's own, in jacfwd
-def test_fit_and_evaluation_work_under_function_transforms() -> None:
-    basis = st.StaFBasis(
-        st.ExponentialKernel(), st.StateFollowingCenters(st.rings(6), st.StateRadius(0.5, 0.1))
-    )
-    x = torch.rand(4, 2, dtype=torch.float64)
-
-    def estimate(at: torch.Tensor) -> torch.Tensor:
-        space = basis.local(at)
-        assert isinstance(space, GradedSpace)
-        return space.evaluate(
-            torch.full((1, 2), 0.05, dtype=torch.float64), space.fit(basis.values(at, smooth_target))
-        )
-
-    together = estimate(x)
-    torch.testing.assert_close(torch.vmap(estimate)(x), together, rtol=1e-13, atol=0)
-    jacobian = torch.vmap(torch.func.jacrev(estimate))(x).squeeze(1)
-    forward = torch.vmap(torch.func.jacfwd(estimate))(x).squeeze(1)
-    torch.testing.assert_close(forward, jacobian, rtol=1e-10, atol=1e-10)
-    assert torch.autograd.gradcheck(lambda at: basis.ideal_weights(at, smooth_target), (x.requires_grad_(),))
-
-
-@pytest.mark.parametrize("size", [0.2, 0.6, 1.0])
-@pytest.mark.parametrize("lead", [(), (9,), (2, 3), (2, 1, 3)])
+@pytest.mark.parametrize(("size", "lead"), [(0.2, ()), (0.6, (9,)), (1.0, (2, 3)), (0.2, (2, 1, 3))])
 def test_directions_of_any_length_and_states_of_any_leading_dimensions(
     size: float, lead: tuple[int, ...]
 ) -> None:
@@ -250,24 +199,24 @@ def test_directions_that_are_learned_are_set_up_anew_at_every_call() -> None:
 # The polynomial kernel.
 
 
-@pytest.mark.parametrize("radius", RADII)
 @pytest.mark.parametrize(
     ("layout", "degree", "bias"),
     [("rings3", 3, 1.0), ("rings6", 2, 0.2), ("rings10", 5, 1.0), ("rings15", 6, 0.5), ("ball15_4", 2, 1.0)],
 )
 def test_polynomial_kernel_is_exact_to_rounding_at_every_radius(
-    layout: str, degree: int, bias: float, radius: float
+    layout: str, degree: int, bias: float
 ) -> None:
     directions = LAYOUTS[layout]()
     dim = directions.shape[1]
     generator = torch.Generator().manual_seed(11)
     x, zeta = 2 * ball_points(1, dim, generator)[0], ball_points(4, dim, generator)
     target, value = (st.targets.Paper(), paper) if dim == 2 else (smooth_target, smooth)
-    centers = st.StateFollowingCenters(directions, radius)
-    staf = st.StaF(st.StaFBasis(st.PolynomialKernel(degree, bias), centers)).fit_(x, target)
-    assert isinstance(staf.basis.local(x), PolynomialSpace)
-    truth = Truth(directions, radius, x, value, polynomial=(degree, bias))
-    assert value_error(staf, truth, radius, zeta) <= 5e-15
+    for radius in RADII:
+        centers = st.StateFollowingCenters(directions, radius)
+        staf = st.StaF(st.StaFBasis(st.PolynomialKernel(degree, bias), centers)).fit_(x, target)
+        assert isinstance(staf.basis.local(x), PolynomialSpace)
+        truth = Truth(directions, radius, x, value, polynomial=(degree, bias))
+        assert value_error(staf, truth, radius, zeta) <= 5e-15, radius
 
 
 def test_polynomial_kernel_with_a_moving_radius_agrees_with_the_constant_one_row_by_row() -> None:

@@ -2,30 +2,25 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 import torch
 from helpers import basis_of, tensor, uniform
-from variants import KERNELS, RADII, over
+from variants import KERNELS, RADII, by_turns, over
 
 import staf_torch as st
-from staf_torch.local_basis import choice
-from staf_torch.local_basis.base import from_scaled
-from staf_torch.local_basis.elimination import Degrees, degrees_of, eliminate, functionals_of, homogeneous
-from staf_torch.local_basis.newton import newton_space
+from staf_torch.local_basis.elimination import degrees_of, eliminate, functionals_of, homogeneous
 from staf_torch.targets import Paper
 
 NEWTON = {name: KERNELS[name] for name in KERNELS if name not in ("exponential", "gaussian", "polynomial")}
 
 
-@over(KERNELS)
-@over(RADII, "radius")
+@pytest.mark.parametrize(("name", "radius"), by_turns([*KERNELS] * 2, list(RADII)))
 def test_weights_and_coefficients_are_two_names_of_one_function(name: str, radius: str) -> None:
     basis = basis_of(name, 3, RADII[radius][0]())
     space = basis.local(uniform(4, 2, low=0.3, high=1.2))
     beta = uniform(4, 3)
     torch.testing.assert_close(space.coefficients(space.weights(beta)), beta, rtol=1e-8, atol=1e-8)
+    assert (space.rank == 3).all()
 
 
 @over(NEWTON)
@@ -37,11 +32,6 @@ def test_squared_length_in_the_newton_basis_is_the_squared_native_norm(name: str
     native = (basis.ideal_weights(x, Paper()) * basis.values(x, Paper())).sum(-1)  # w'K w = w'V
     scaled = beta.square().sum(-1) * (1.0 if gain is None else (-gain).exp())
     torch.testing.assert_close(scaled, native, rtol=1e-8, atol=1e-10)
-
-
-@over(KERNELS)
-def test_rank_is_full_for_well_separated_centers(name: str) -> None:
-    assert (basis_of(name, 6, 0.8).local(uniform(4, 2, low=0.4)).rank == 6).all()
 
 
 def test_rank_says_where_the_gram_matrix_is_numerically_singular() -> None:
@@ -67,9 +57,8 @@ def test_one_factor_serves_all_states() -> None:
     assert basis_of("matern32").local(uniform(5, 4, 2)).factor.factor.shape == (6, 6)
 
 
-@pytest.mark.parametrize("kernel", ["exponential", "gaussian"])
-@pytest.mark.parametrize("count", [3, 6])
-@pytest.mark.parametrize("bound", [0.05, 0.4, 1.2, 2.5, 5.0])  # above 1 or so no series serves all states
+@pytest.mark.parametrize(("kernel", "count"), [("exponential", 6), ("gaussian", 3), ("gaussian", 6)])
+@pytest.mark.parametrize("bound", [0.4, 1.2, 5.0])  # above 1 or so no series serves all states
 def test_a_radius_that_moves_gives_what_the_constant_one_of_its_size_gives(
     kernel: str, count: int, bound: float
 ) -> None:
@@ -78,7 +67,7 @@ def test_a_radius_that_moves_gives_what_the_constant_one_of_its_size_gives(
     together = basis_of(kernel, count, moving)
     space = together.local(x)
     found = space.fit(together.values(x, Paper()))
-    for row, at in enumerate(x):
+    for row, at in enumerate(x[:3]):
         alone = basis_of(kernel, count, float(moving(at)))
         expected = alone.local(at).fit(alone.values(at, Paper()))
         assert found[row].isfinite().all()
@@ -88,28 +77,9 @@ def test_a_radius_that_moves_gives_what_the_constant_one_of_its_size_gives(
         )
 
 
-def test_weights_whose_factor_underflows_are_lost_unless_they_are_zero() -> None:
-    kernel = st.ExponentialKernel()
-    x = torch.tensor([[30.0, 0.0], [1.0, 0.0]], dtype=torch.float64)  # e^-900 and e^-1
-    some = torch.tensor([[2.0, 0.0], [2.0, 0.0]], dtype=torch.float64)
-    found = from_scaled(kernel, x, some)
-    assert bool(found[0].isnan().all())
-    assert bool(torch.isfinite(found[1]).all())
-    assert from_scaled(kernel, x, 0 * some).tolist() == [[0.0, 0.0], [0.0, 0.0]]
-
-
-@pytest.mark.parametrize("kernel", [st.ExponentialKernel(), st.GaussianKernel(0.7), st.MaternKernel(1.5)])
-def test_weights_of_a_newton_space_of_any_kernel_interpolate(kernel: st.Kernel) -> None:
-    x, offsets = uniform(5, 2, seed=1), 0.6 * st.rings(6)
-    space, centers = newton_space(kernel, x, offsets), x.unsqueeze(-2) + offsets
-    values = Paper()(centers)
-    weights = space.weights(space.fit(values))
-    found = (kernel(centers, centers) * weights.unsqueeze(-2)).sum(-1)
-    torch.testing.assert_close(found, values, rtol=1e-8, atol=1e-8)
-
-
-@pytest.mark.parametrize("kernel", ["exponential", "gaussian", "polynomial"])
-@pytest.mark.parametrize("lead", [(4097,), (2, 2, 2049)])
+@pytest.mark.parametrize(
+    ("kernel", "lead"), by_turns(["exponential", "gaussian", "polynomial"], [(4097,), (2, 2, 2049)])
+)
 def test_a_large_batch_that_goes_in_blocks_is_what_its_rows_are(kernel: str, lead: tuple[int, ...]) -> None:
     basis, x = basis_of(kernel, 3, st.StateRadius(0.4, 0.1)), uniform(*lead, 2, low=0.3, seed=1)
     values = basis.values(x, Paper())
@@ -120,24 +90,6 @@ def test_a_large_batch_that_goes_in_blocks_is_what_its_rows_are(kernel: str, lea
 
 
 # What fixes a basis.
-
-
-@pytest.mark.parametrize(("dim", "count"), [(1, 4), (2, 6), (2, 7), (3, 9)])
-def test_functionals_are_orthonormal_and_blind_to_lower_degrees(dim: int, count: int) -> None:
-    points = uniform(count, dim, low=-1.0, seed=count)
-    points = points / points.norm(dim=-1).max()
-    found = eliminate(points)
-    q = found.functionals
-    torch.testing.assert_close(q.mT @ q, torch.eye(count).double(), rtol=0, atol=1e-12)
-    assert list(found.degrees) == sorted(found.degrees)
-    for j, degree in enumerate(found.degrees):
-        for k in range(degree):
-            assert float((q[:, j] @ homogeneous(points, k)).abs().max()) < 1e-12
-        seen = float((q[:, j] @ homogeneous(points, degree)).norm())
-        assert seen == pytest.approx(float(found.strengths[j]), rel=1e-9)
-        assert seen > 1e-6
-    for k in range(max(found.degrees)):
-        assert found.degrees.count(k) == math.comb(dim + k - 1, k)
 
 
 def test_functionals_that_have_one_value_span_the_same_and_see_their_own_monomial_with_a_plus() -> None:
@@ -161,50 +113,3 @@ def test_functionals_that_have_one_value_span_the_same_and_see_their_own_monomia
                 for each in (found, whole)
             )
             torch.testing.assert_close(ours @ ours.mT, theirs @ theirs.mT, rtol=0, atol=1e-10)
-
-
-def test_homogeneous_monomials_have_the_norm_of_the_power() -> None:
-    points = uniform(5, 3, low=-1.0, seed=13)
-    for degree in range(4):
-        rows = homogeneous(points, degree)
-        assert rows.shape == (5, math.comb(2 + degree, degree))
-        torch.testing.assert_close(rows @ rows.mT, (points @ points.mT) ** degree)
-
-
-def test_degrees_come_back_from_lists_and_count_their_monomials() -> None:
-    found = degrees_of(0.3 * st.rings(6))
-    assert found.reach == pytest.approx(0.3)
-    assert found.sizes() == (1, 2, 3)
-    assert found.each() == (0, 1, 1, 2, 2, 2)
-    assert [sum(row) for block in found.monomials for row in block] == [0, 1, 1, 2, 2, 2]
-    listed = {"monomials": [[list(row) for row in block] for block in found.monomials], "reach": found.reach}
-    assert Degrees.of(listed) == found
-    assert degrees_of(torch.zeros(1, 2).double()) == Degrees((((0, 0),),), 1.0)
-
-
-def test_points_that_coincide_are_refused_with_their_number() -> None:
-    points = torch.cat((st.rings(3), st.rings(3)[:2] + 1e-16))
-    with pytest.raises(ValueError, match=r"must be told apart by polynomials: 2 of 5 directions coincide"):
-        eliminate(points)
-
-
-@pytest.mark.parametrize(
-    ("kernel", "count", "kind"),
-    [
-        (st.ExponentialKernel(), 6, "graded"),
-        (st.GaussianKernel(0.5), 3, "graded"),
-        (st.MaternKernel(1.5), 3, "newton"),
-        (st.PolynomialKernel(2), 6, "polynomial"),
-        (st.PolynomialKernel(3), 6, "polynomial"),
-        (st.PolynomialKernel(1), 6, "newton"),
-        (st.PolynomialKernel(1), 3, "polynomial"),
-    ],
-)
-def test_a_kernel_gets_the_basis_that_it_allows(kernel: st.Kernel, count: int, kind: str) -> None:
-    found, degrees = choice.choose(kernel, st.rings(count))
-    assert found == kind
-    assert (degrees is None) is (kind == "newton")
-    empty = torch.empty(count, 2, device="meta")
-    named, nothing = choice.choose(kernel, empty)
-    assert nothing is None
-    assert named == ("polynomial" if isinstance(kernel, st.PolynomialKernel) else kind)
