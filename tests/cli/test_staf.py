@@ -114,11 +114,6 @@ RUNS = {
 
 # What a user gets wrong
 BAD: dict[str, tuple[str, tuple[str, ...]]] = {
-    "launcher of an extra": (
-        "hydra/launcher=nope",
-        ("there are basic, batched", "extras joblib, slurm, ray and"),
-    ),
-    "unknown key of a group": ("kernel=gaussian kernel.wdth=2", ("did you mean `kernel.width`?",)),
     "key of another choice": (
         "kernel.width=0.5",
         ("`kernel.width` with these choices; ", "kernel=gaussian have it."),

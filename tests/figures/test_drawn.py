@@ -37,27 +37,27 @@ class Drawn(NamedTuple):
     names: list[str]  # of curves, in their order
 
 
-def of_a_chase(count: int) -> Drawn:
-    parts = [wave(9, 2), wave(9), wave(9) + 0.1 * T, wave(9) + 0.01 * T, wave(9, count), wave(9, count) + 1]
+def of_a_chase() -> Drawn:
+    parts = [wave(9, 2), wave(9), wave(9) + 0.1 * T, wave(9) + 0.01 * T, wave(9, 2), wave(9, 2) + 1]
     excess = np.where(np.arange(9) == 3, 0.0, wave(9))
     errors = [0.1 * T, 0.01 * T, positive(excess)]  # on a logarithmic axis
     names = ["$x_{1}$", "$x_{2}$", "$V(x)$", r"$\hat V(x)$"]
-    names += [f"$a_{{{i + 1}}}$" for i in range(count)] if count < 7 else ["weights $a$"]
+    names += ["$a_{1}$", "$a_{2}$"]
     names += ["ideal $w$", r"$|V - \hat V|$", "of ideal $w$", "$F(a) - F(w)$"]
     figure = chase.draw_chase(chase.ChaseHistory(T, *parts, excess))
     shown = [(T, values) for values in (*parts[:3], *parts[4:], *errors)]
     return Drawn(figure, shown, ["state $x$", "value", "weights", "error at $x$; excess $F$"], names)
 
 
-def of_a_memory(dim: int) -> Drawn:
+def of_a_memory() -> Drawn:
     errors, excess = {"kept": wave(9), "fresh": wave(9) + 1}, {"zero": wave(4), "stored": wave(4) + 1}
-    picture = chase.MemoryPicture(wave(9, dim), wave(5, dim) + 1, wave(5), T, errors, excess, 0.3)
+    picture = chase.MemoryPicture(wave(9, 3), wave(5, 3) + 1, wave(5), T, errors, excess, 0.3)
     figure = chase.draw_memory(picture)
     np.testing.assert_allclose(figure.axes[0].collections[0].get_offsets()[:, 0], picture.stored[:, 0])
-    shown = [(part[:, 0], part[:, min(dim, 2) - 1]) for part in (picture.path, picture.stored)]
+    shown = [(part[:, 0], part[:, 1]) for part in (picture.path, picture.stored)]
     shown += [(T, values) for values in errors.values()]
     shown += [(np.arange(1, 5), values) for values in excess.values()] + [([0, 1], np.array([0.3, 0.3]))]
-    panels = [f"$x_{min(dim, 2)}$", r"$\max\,|V - \hat V|$ on the ball", "largest excess"]
+    panels = ["$x_2$", r"$\max\,|V - \hat V|$ on the ball", "largest excess"]
     names = ["path", "stored model", *errors, *excess, "settled chase"]
     return Drawn(figure, shown, panels, names)
 
@@ -159,10 +159,8 @@ def of_layouts() -> Drawn:
 
 
 FIGURES: dict[str, Callable[[], Drawn]] = {
-    "a chase": lambda: of_a_chase(2),
-    "a chase of many centers": lambda: of_a_chase(7),
-    "a memory on a line": lambda: of_a_memory(1),
-    "a memory in space": lambda: of_a_memory(3),
+    "a chase": of_a_chase,
+    "a memory": of_a_memory,
     "a loop that learns": lambda: of_a_loop(3, True),
     "a loop of many functions": lambda: of_a_loop(7, False),
     "a feedback": lambda: of_a_loop(0, False),
@@ -175,7 +173,7 @@ FIGURES: dict[str, Callable[[], Drawn]] = {
 }
 
 
-CROWDED = {"a chase", "a loop that learns", "faults", "layouts"}
+CROWDED = {"a chase", "a loop that learns", "faults"}
 """Those whose legends and names are looked at in a column of 3.4 inches, laid out."""
 
 

@@ -157,7 +157,9 @@ def test_rows_with_bounds_of_their_own_are_drawn_with_the_widest() -> None:
     low, high = rows(tensor([[-2.0], [-3.0]])), rows(tensor([[2.0], [1.0]]))
     cost = adp.QuadraticCost(1.0, 0.1, dim=2, inputs=1).bounded(low, high)
     plant = systems.Pendulum()
-    loop = adp.simulate(adp.LQR(plant, cost), plant, cost, tensor([[0.3, 0.0], [0.2, 0.0]]), dt=0.1, steps=3)
+    loop = adp.simulate(
+        adp.LQR(plant, cost), plant, cost, tensor([[0.3, 0.0], [0.2, 0.0]]), dt=0.1, steps=3, compile=False
+    )
     for one in (loop, pickle.loads(pickle.dumps(loop))):
         assert "bounds -3 to 2, or less in some rows" in str(one)
         drawn = lines(visible(one.figure())[2])

@@ -44,6 +44,7 @@ def test_number_of_steps_survives_rounding(dt: float, duration: float, steps: in
         ("device=nope", "`staf device=...` cannot be used here"),
         ("kernel=custom kernel.path=math.cos", "(kernel=...)` must be a Kernel"),
         ("target=custom target.path=math.pi", "`staf target=...` must be callable"),
+        ("system=custom system.path=math.cos", "must be a plant with a method `drift`"),
     ],
 )
 def test_a_bad_value_is_named(line: str, said: str) -> None:

@@ -159,15 +159,6 @@ def test_a_resumed_sweep_runs_what_is_missing_and_ends_with_the_same_bits(
     assert (again / "0" / "run.json").stat().st_mtime_ns == first
 
 
-def test_an_unknown_swept_key_starts_nothing(place: Path) -> None:
-    (place / "runs").mkdir(exist_ok=True)
-    before = set((place / "runs").iterdir())
-    code, _, err = one(str(place), ["-m", "centers.raduis=0.1,0.2", *SHORT])
-    assert code == 1
-    assert err == "staf: there is no setting `centers.raduis`; did you mean `centers.radius`?\n"
-    assert set((place / "runs").iterdir()) == before
-
-
 @pytest.mark.parametrize("line", ["batch=0", "workers=0", "foreign=ask"])
 def test_what_the_launcher_is_told_is_checked_before_anything_runs(line: str, place: Path) -> None:
     directory, said = sweep(place, "refused", "seed=0,1", f"hydra.launcher.{line}", code=1)
@@ -215,16 +206,12 @@ def test_hydra_knows_of_a_job_while_it_runs_and_what_was_typed_is_kept_as_typed(
 
 
 def test_equal_failures_are_told_once_and_end_a_sweep_where_nothing_swept_matters(place: Path) -> None:
-    wrong = ["centers.count=4", "seed=range(10)", "kernel=exponential,gaussian", *SHORT]
+    wrong = ["centers.count=4", "seed=range(5)", "kernel=exponential,gaussian", *SHORT]
     directory, said = sweep(place, "alike", *wrong, code=1)
     assert said.count(f"failed: {BAD}") == 2  # as it happened, and in the table's note
-    assert "15 more failed like job 0 (" in said
-    assert said.endswith(f"staf: 16 jobs failed with the same error, the other 4 were not run: {BAD}\n")
-    assert len(list(directory.glob("*/run.json"))) == 16
-    _, said = sweep(place, "alike_here", "centers.count=4,3", "seed=range(9)", *SHORT, code=1)
-    assert "18 of 18 jobs" not in said
-    assert "8 more failed like job 0 (" in said
-    assert len(rows(place / "runs" / "alike_here")) == 18  # the other half went well
+    assert "7 more failed like job 0 (" in said
+    assert said.endswith(f"staf: 8 jobs failed with the same error, the other 2 were not run: {BAD}\n")
+    assert len(list(directory.glob("*/run.json"))) == 8
 
 
 def test_a_directory_is_one_jobs(place: Path) -> None:

@@ -82,11 +82,6 @@ def test_an_unknown_name_is_refused_with_those_that_exist(option: str, found: Co
     assert known in str(raised.value)
 
 
-def test_the_last_part_of_a_name_finds_the_whole(found: Collection) -> None:
-    with pytest.raises(ValueError, match=r"must be one of centers.count, .*; got 'count'"):
-        tabulate(found, Layout(columns=("count",)))
-
-
 @pytest.mark.parametrize("freedom", [1, 2, 3, 10, 99, 100, 199, 200, 201, 300, 1000, 10**6])
 def test_quantile_of_students_t_is_exact(freedom: int) -> None:
     assert student_quantile(freedom) == pytest.approx(student.ppf(0.975, freedom), rel=1e-10)
