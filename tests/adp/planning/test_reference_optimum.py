@@ -106,20 +106,11 @@ def test_some_recorded_states_are_shot_from_where_no_formula_is_known(
     off = (loop.control[:, at] - control).norm(dim=-1)
     torch.testing.assert_close(found.control_error[:, at], off, rtol=1e-9, atol=1e-9)
     torch.testing.assert_close(found.value_error[:, at], (value - x.square().sum(-1)).abs())
-    (said,) = [record.getMessage() for record in caplog.records]
-    assert "9 states, 24 intervals over 2.5 s" in said
-    single = optima(given, X0.float().view(3, 1, 2))
-    assert single is not None
-    assert (single.value.dtype, single.value.shape, single.control.shape) == (
-        torch.float32,
-        (3, 1),
-        (3, 1, 1),
-    )
+    assert "9 states, 24 intervals over 2.5 s" in caplog.text
 
 
-@pytest.mark.parametrize("states", [3, 0])
-def test_one_state_a_row_gives_the_cost_alone(states: int) -> None:
-    found = compare(problem(cost=BOUNDED, shooting=True, states=states), result())
+def test_one_state_a_row_gives_the_cost_alone() -> None:
+    found = compare(problem(cost=BOUNDED, shooting=True, states=3), result())
     assert found.cost is not None
     assert (found.control_error, found.value_error) == (None, None)
 
