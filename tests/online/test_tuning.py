@@ -7,7 +7,6 @@ import pickle
 import pytest
 import torch
 from helpers import tensor
-from helpers_streams import mixture
 from torch import Tensor
 
 import staf_torch as st
@@ -59,12 +58,9 @@ def test_each_coordinate_and_each_stream_has_its_own_width() -> None:
     assert float(found.spread[1, 0]) > 1.5 * float(found.spread[1, 1])
 
 
-@pytest.mark.parametrize(("steps", "seed"), [(150, 1), (220, 2)])
-def test_streams_that_drift_are_followed_and_others_predicted_as_by_one_that_never_forgets(
-    steps: int, seed: int
-) -> None:
+def test_streams_that_drift_are_followed_and_others_predicted_as_by_one_that_never_forgets() -> None:
     """By their errors: forgetting, noise and width predict nearly alike along a ridge of values."""
-    x, y = drawn(torch.tensor([0.7, 0.7]).double(), 0.05, steps=steps, seed=seed)
+    x, y = drawn(torch.tensor([0.7, 0.7]).double(), 0.05, steps=150, seed=1)
     drift = y + (0.15 * torch.arange(len(y), dtype=torch.float64)).sin() * x[:, 0]
     both = x[:, None].expand(-1, 2, -1), torch.stack((y, drift), 1)
     resting, drifting = errors(st.StaFRegressor().tune(*both), *both)
@@ -97,22 +93,11 @@ def test_the_gradient_finds_what_is_at_least_as_likely_as_the_best_of_the_search
     assert all(each is not None for each in found)
     searched, ascended = (each.likelihood for each in found if each is not None)
     assert bool((ascended > searched - 0.01).all())
-    alone = st.StaFRegressor(count=2).tune(x[:, 1:], y[:, 1:], method="gradient").tuning
-    assert alone is not None
-    torch.testing.assert_close(alone.likelihood, ascended[1:])
     with pytest.raises(ValueError, match=r"tune\(method=...\)` must be one of .*; got 'newton'"):
         st.StaFRegressor().tune(x, y, method="newton")
     wide = torch.randn(50, 7, dtype=torch.float64)
     with pytest.raises(ValueError, match="'search' for more than 15 centers, of which 7 coordinates take 36"):
         st.StaFRegressor().tune(wide, wide[:, 0], method="gradient")
-
-
-def test_a_mixture_has_nothing_to_tune() -> None:
-    x, y = drawn(torch.tensor([0.7, 0.7]).double(), 0.1, steps=30)
-    model = mixture()
-    assert model.tune(x, y) is model
-    with pytest.raises(ValueError, match=r"tune.*must have the shape"):
-        st.StaFRegressor().tune(x[:, 0], y)
 
 
 @pytest.mark.needs_compiler
@@ -154,14 +139,13 @@ def test_stretch_in_which_a_coordinate_hardly_moves_says_so_and_nothing_about_it
 
 
 def test_tuning_of_a_stream_is_the_same_whoever_is_beside() -> None:
-    pairs = [drawn(torch.tensor([0.7, 0.7]).double(), 0.1, steps=60, seed=seed) for seed in range(3)]
+    pairs = [drawn(torch.tensor([0.7, 0.7]).double(), 0.1, steps=40, seed=seed) for seed in range(2)]
     x, y = (torch.stack([pair[k] for pair in pairs], 1) for k in range(2))
     together = st.StaFRegressor().tune(x, y).tuning
-    alone = {k: st.StaFRegressor().tune(x[:, k], y[:, k]).tuning for k in (2,)}
+    alone = st.StaFRegressor().tune(x[:, 1], y[:, 1]).tuning
     assert together is not None
-    for k, own in alone.items():
-        assert own is not None
-        assert all(torch.equal(a[k], b[0]) for a, b in zip(together, own, strict=True))
+    assert alone is not None
+    assert all(torch.equal(a[1], b[0]) for a, b in zip(together, alone, strict=True))
 
 
 def test_samples_that_no_candidate_explains_do_not_choose() -> None:
