@@ -63,11 +63,9 @@ def test_an_experiment_of_ones_own_is_found_by_its_path() -> None:
     ("task", "words"),
     [
         ("no such one", "must be one of 'gradient_chase'"),
-        (3, "must be one of 'gradient_chase'"),
         (None, "must be one of 'gradient_chase'"),
         ("no_such_module.run", r"cannot be imported \(No module named 'no_such_module'\)"),
         (f"{__name__}.nothing", "cannot be imported .*has no attribute 'nothing'"),
-        (".run", "cannot be imported"),
         (f"{__name__}.not_callable", "must be an experiment, which can be called"),
     ],
 )
@@ -76,29 +74,19 @@ def test_what_is_no_experiment_is_refused(task: object, words: str) -> None:
         experiment(task)
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "shared"),
-    [
-        ("number", 2.5, "number"),
-        ("number", 3, "number"),
-        ("number", True, [True]),
-        ("number", "word", ["word"]),
-        ("number", None, [None]),
-        ("number", [1.0, [2, "a"], False], ["number", ["number", ["a"]], [False]]),
-        ("other", 2.5, 2.5),
-        ("group.a", 1.0, "number"),
-        ("group.inner.b", 1.0, "number"),
-        ("group.other.b", 1.0, "number"),
-        ("group", 1.0, 1.0),
-        ("plain.dotted", 1.0, "number"),
-        ("plain.other", 1.0, 1.0),
-        ("plain", 1.0, 1.0),
-    ],
-)
-def test_a_batch_shares_all_of_a_setting_but_the_numbers_that_may_differ(
-    name: str, value: object, shared: object
-) -> None:
-    assert Mine().shared(name, value) == shared
+def test_a_batch_shares_all_of_a_setting_but_the_numbers_that_may_differ() -> None:
+    shared = Mine().shared
+    assert [shared("number", each) for each in (3, True, "word", None)] == [
+        "number",
+        [True],
+        ["word"],
+        [None],
+    ]
+    assert shared("number", [1.0, [2, "a"], False]) == ["number", ["number", ["a"]], [False]]
+    for name in ("group.a", "group.inner.b", "group.other.b", "plain.dotted"):
+        assert shared(name, 1.0) == "number"
+    for name in ("other", "group", "plain.other", "plain"):
+        assert shared(name, 1.0) == 1.0
 
 
 def test_what_is_not_finite_is_none() -> None:

@@ -256,18 +256,3 @@ def test_an_angle_is_a_coordinate_that_may_turn_once_more_and_not_less(name: str
         turn, part = ((moved(way * unit) - moved(still)).abs().max() for way in (2 * math.pi, 1.0))
         assert (k in case.periodic) == (float(turn) < 1e-9 < float(part)), k
     assert set(case.periodic) == {k for k in range(case.dim) if k in case.plant().periodic}
-
-
-def test_a_plan_of_ipopt_begins_from_the_last_one_a_period_later() -> None:
-    pytest.importorskip("casadi", reason="needs the extra rivals")
-    case = dataclasses.replace(CASES["double_integrator"], horizon=4)
-    steer = rival_methods.ipopt(case)(torch.tensor([[2.0, 0.0]], dtype=torch.float64))
-    x = torch.tensor([[2.0, 0.0]], dtype=torch.float64)
-    problem = case.problem()
-    for _ in range(3):
-        u = steer(x)
-        assert u.shape == (1, 1)
-        assert -1 - 1e-6 <= float(u) <= 1 + 1e-6
-        x, _ = problem.advance(x, u)
-    fresh = rival_methods.ipopt(case)(x)(x)
-    torch.testing.assert_close(steer(x), fresh, rtol=0, atol=1e-5)

@@ -140,12 +140,6 @@ def test_a_setting_whose_name_is_put_together_is_refused_by_it(
     refused((given,), name, value, tmp_path / "run")
 
 
-class Unmoved(staf_torch.systems.TwoState):
-    """A plant that does not say its dimension."""
-
-    dim = None
-
-
 OTHER_KINDS = [
     (
         ("experiment=safe_box",),
@@ -153,23 +147,9 @@ OTHER_KINDS = [
         "must be a ControlAffineSystem",
     ),
     (
-        ("experiment=adp",),
-        {"system": {"_target_": f"{__name__}.Unmoved"}},
-        "must be a `systems.Plant` with `dim`",
-    ),
-    (
         (),
         {"metric": {"_target_": "staf_torch.systems.TwoState"}},
         "must be a `staf_torch.metrics.Metric`, or several",
-    ),
-    (
-        ("experiment=flat_limit",),
-        {
-            "system": {"_target_": "staf_torch.systems.Linear", "matrix": [[-1.0]]},
-            "initial_state": [1.0],
-            "centers": {"layout": "simplex", "count": None, "radius": 0.1, "shrink": {"offset": 0.0}},
-        },
-        "must have two states for flat_limit",
     ),
 ]
 

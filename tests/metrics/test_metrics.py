@@ -6,41 +6,16 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from helpers import basis_of, tensor, uniform
+from helpers import basis_of, uniform
 from variants import KERNELS, over
 
 import staf_torch as st
-from staf_torch import systems
 from staf_torch.approximation.conditioning import sup_error
 from staf_torch.metrics.ball_error import StateErrorPass
-from staf_torch.metrics.chase import ChaseMetrics, Member
 from staf_torch.numerics.linalg import condition_number
-from staf_torch.optim import SteepestDescent
 from staf_torch.targets import Paper
 
 MOVING = ("exponential", "matern52")  # a graded and a Newton space, at a moving radius
-
-
-def test_metrics_are_the_worst_over_the_window() -> None:
-    """Of a chase; tests/metrics/test_windows.py has members, pieces and rows that diverge."""
-    start = tensor([[1.0, 0.0], [0.3, 0.9], [-1.2, 0.4]])
-    states = systems.simulate(systems.Oscillator(), start, dt=0.05, steps=60)
-    basis, law, window = basis_of("matern52", 3), SteepestDescent(), slice(40, None)
-    result = st.chase(states, basis, Paper(), law, inner_steps=10)
-    metrics = ChaseMetrics(basis, Paper(), law, inner_steps=10, members=[Member(3, 0.05, 2.0)])
-    metrics.add(result)
-    (found,) = metrics.summaries()
-    value = result.value[:, window]
-    expected = {
-        "ultimate_error": (value - result.estimate[:, window]).abs().max(),
-        "ultimate_excess": result.excess[:, window].max(),
-        "condition_number": condition_number(basis.gram(result.state[:, window])).max(),
-        "ball_floor_error": sup_error(basis, result.state[:, window], Paper(), 97).max(),
-        "contraction_violations": 0.0,
-        "diverged_fraction": 0.0,
-    }
-    for key, number in expected.items():
-        assert found[key] == pytest.approx(float(number), rel=1e-6), key
 
 
 def in_kernels(basis: st.StaFBasis, x: torch.Tensor, target: Callable[..., torch.Tensor]) -> torch.Tensor:

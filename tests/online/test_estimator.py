@@ -248,23 +248,6 @@ def test_what_was_tuned_holds_for_as_many_streams_coordinates_and_outputs_alone(
                 call(of_x, of_y)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"kernel": st.GaussianKernel(tensor([1.0, 2.0]))}, "kernel.*one value a hyperparameter"),
-        (
-            {"radius": 0.5, "kernel": st.GaussianKernel(0.015)},
-            "radius.*GaussianKernel does not overflow.*0.5",
-        ),
-        ({"noise": 1e-9}, "noise.*at least"),
-        ({"forgetting": 1.5}, r"forgetting.*in \(0, 1\]"),
-    ],
-)
-def test_bad_arguments_are_named(arguments: dict[str, object], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        st.StaFRegressor(**arguments).partial_fit(tensor([0.0, 1.0]), 1.0)  # type: ignore[arg-type]
-
-
 @pytest.mark.parametrize("kernel", [*map(str, NAMED), Cauchy()], ids=str)
 @pytest.mark.parametrize("dim", [2])
 def test_a_kernel_that_is_narrow_for_its_ball_is_told(

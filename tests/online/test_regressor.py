@@ -7,15 +7,13 @@ import math
 
 import pytest
 import torch
-from helpers import changed, tensor, uniform
+from helpers import tensor, uniform
 from helpers_streams import MODELS, hard_stream
 from torch import Tensor
 from variants import KERNELS, over
 
 import staf_torch as st
-from staf_torch.online.kalman_filter import LocalFilter
 from staf_torch.online.local_functions import LocalFunctions
-from staf_torch.online.stream_state import StreamState
 
 SEVERAL = tensor([[0.4, -0.7], [0.9, 0.3], [-0.2, 0.6]]).mT  # states (n, S)
 
@@ -84,32 +82,6 @@ def test_basis_is_orthonormal_in_the_native_space(kernel: str) -> None:
     expected = frame.kernel.core(SEVERAL[:, 0], frame.offsets, frame.offsets)
     torch.testing.assert_close(psi.mT @ psi, expected, rtol=1e-7, atol=1e-9)
     torch.testing.assert_close(frame.variance(x, frame.offsets.mT), expected.diagonal())
-
-
-@over(KERNELS, "kernel")
-def test_around_one_anchor_the_filter_is_gaussian_process_regression(kernel: str) -> None:
-    """u | y of y = psi'u + rest + noise in one solve, the rests independent."""
-    frame, ratio = frame_of(kernel), 1e-3
-    z, y = 0.3 * uniform(2, 8, seed=4), uniform(8, seed=5)
-    state = StreamState.empty(torch.zeros(0).double(), 1, 2, 6, 1)
-    filter_ = LocalFilter(frame, tensor([ratio]), tensor([1.0]), slack=1.0)
-    filter_.learn(state, SEVERAL[:, :1].mT, tensor([[0.0]]))  # the first sample says where the centers are
-    parts = state.parts(state.table)
-    nothing = changed(parts, mean=torch.zeros_like(parts.mean), learned=torch.zeros_like(parts.learned))
-    state.put(state.whole(nothing))
-    for k in range(8):
-        filter_.learn(state, (SEVERAL[:, :1] + z[:, k : k + 1]).mT, y[k : k + 1, None])
-    x = SEVERAL[:, :1].expand(2, 8)
-    log_factor = frame.log_factor(x, z)
-    factor = torch.ones(8, dtype=torch.float64) if log_factor is None else log_factor.exp()
-    psi = frame.functions(x, z) * factor
-    rest = frame.variance(x, z) * factor.square() - psi.square().sum(0) + ratio
-    covariance = psi.mT @ psi + rest.diag()
-    torch.testing.assert_close(
-        state.mean[0, :, 0], psi @ torch.linalg.solve(covariance, y), rtol=1e-7, atol=1e-8
-    )
-    expected = psi @ torch.linalg.solve(covariance, psi.mT)
-    torch.testing.assert_close(state.learned[..., 0], expected, rtol=1e-7, atol=1e-8)
 
 
 @pytest.mark.parametrize(

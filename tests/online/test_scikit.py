@@ -162,5 +162,3 @@ def test_the_adapter_registers_with_river_and_keeps_to_one_model(monkeypatch: py
     clone = adapter.clone()
     assert clone.model is not model
     assert (clone.features, clone.predict_one({"a": 1}), clone.model.radius) == ((), 0.0, 0.4)
-    other = st.StaFRegressor(radius=0.1)
-    assert adapter.clone({"model": other}).model is other

@@ -182,19 +182,6 @@ def test_published_robot_under_the_lqr_in_s() -> None:
     assert float(plant.transform(tensor(z[:4]))[0]) == pytest.approx(-0.215, abs=5e-4)
 
 
-def test_a_held_control_moves_s_as_runge_kutta_in_s_does() -> None:
-    plant, cost = chain(), adp.QuadraticCost(10.0, 0.1, dim=2, inputs=1)
-    s0 = plant.transform(tensor([[-6.5, 6.5], [1.0, 2.0]]))
-    lqr = adp.LQR(plant, cost)
-    run = adp.simulate(adp.Feedback(lqr), plant, cost, s0, dt=2e-4, steps=1)
-    torch.testing.assert_close(
-        run.state[:, 1],
-        systems.runge_kutta_step(lambda s: plant.rate(s, lqr(s0)), s0, 2e-4),
-        rtol=1e-10,
-        atol=0,
-    )
-
-
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_a_millionth_from_the_wall_nobody_who_can_brake_leaves(dtype: torch.dtype) -> None:
     """Speed has a wall of its own; where x1 is, there is room to brake or it moves inward."""

@@ -168,10 +168,8 @@ def test_guesses_are_states_or_pairs_and_angles_are_counted_from_either_end() ->
     given: dict[str, Any] = {"dim": 2, "inputs": 1, "dt": 0.1}
     for guess, rest in (
         (None, 0.0),
-        ([0.5, 0.0], np.sin(0.5)),
         (([0.5, 0.0], [0.3]), np.sin(0.5)),
         ((0.5, 0.0), np.sin(0.5)),  # a tuple of two numbers is a state
-        ((tensor([0.5, 0.0]), tensor([9.0])), np.sin(0.5)),
     ):
         plant = systems.StepPlant(step, equilibrium=guess, periodic=[-2, 0], **given)
         assert plant.periodic == (0,)

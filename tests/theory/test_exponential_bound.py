@@ -6,13 +6,10 @@ import math
 
 import pytest
 import torch
-from helpers import tensor
 from helpers_theory import random_offsets
-from torch import Tensor
 from variants import by_turns
 
 from staf_torch import targets, theory
-from staf_torch.theory.exponential_bound import DomainProblem
 
 PAPER = targets.Paper()
 
@@ -110,36 +107,6 @@ def test_bad_arguments_of_the_bound_are_named(wrong: dict[str, object], message:
 
 
 STATES = theory.disc(1.0, count=5)
-
-
-@pytest.mark.parametrize(
-    ("states", "epsilon"),
-    [(STATES, 0.4), (tensor([[0.3, -0.8]]), 0.01), (theory.disc(0.5, dim=1, count=3), 0.01)],
-)
-def test_tolerances_are_those_of_the_proof(states: Tensor, epsilon: float) -> None:
-    """eps' / (2 A) and eps' / (2 A |V|), A = sup e^{y'x}, eps' + eps'^2 / (4 A |V|) = epsilon."""
-    target = targets.Cosine(2.0) if states.shape[1] == 1 else PAPER
-    given = DomainProblem("a test", target, torch.float64, states, 0.2, epsilon, 16)
-    points = states.unsqueeze(1) + given.offsets(30, 3)
-    size = float(target(points).abs().max())
-    norms = states.norm(dim=-1)
-    A = float((norms * (norms + 0.2)).max().exp())
-    (value, exponential), product = given.factors(), given.product()
-    split = 2 * A * float(value.tolerance[0])
-    assert split + split**2 / (4 * A * size) == pytest.approx(epsilon, rel=1e-4)
-    ones = torch.ones(len(states), dtype=torch.float64)
-    torch.testing.assert_close(value.tolerance, split / (2 * A) * ones)
-    shrink = (-states.square().sum(-1)).exp()  # e^{-x'x}, which is divided out
-    torch.testing.assert_close(exponential.tolerance, split / (2 * A * size) / shrink, rtol=1e-3, atol=0)
-    torch.testing.assert_close(product.tolerance, epsilon * ones)
-    z = given.offsets(1, 1)
-    growth = (states @ z.mT).exp()
-    for functions, values, weight in (
-        (value, target(states.unsqueeze(1) + z), torch.ones_like(growth)),
-        (exponential, 1 / growth, torch.ones_like(growth)),
-        (product, target(states.unsqueeze(1) + z) / growth, growth),
-    ):
-        torch.testing.assert_close(functions.evaluate(z), (values, weight))
 
 
 def test_the_last_degree_that_is_allowed_is_tried_and_a_polynomial_needs_its_own() -> None:
