@@ -172,22 +172,10 @@ def test_a_mass_is_pushed_by_the_lqr_of_the_sampled_double_integrator() -> None:
     _, one = made("mass", "avoidance.bound=3", "adp.q=2", "adp.r=0.5")
     x, u = uniform(5, 4, low=-0.2, high=0.2, seed=3), uniform(5, 2, seed=2)
     torch.testing.assert_close(one.rate(x, u), torch.cat((x[:, 2:], u), dim=-1))
-    h = 0.1  # one axis alone: P of its Riccati equation, by iteration
-    a, b = np.array([[1, h], [0, 1]]), np.array([[h * h / 2], [h]])
-    big = np.zeros((3, 3))  # of the integral of the cost over a period with the control held
-    nodes, weights = np.polynomial.legendre.leggauss(6)
-    for node, weight in zip(nodes, weights, strict=True):
-        t = h * (node + 1) / 2
-        z = np.array([[1, t, t * t / 2], [0, 1, t]])
-        big += h * weight / 2 * (2.0 * z.T @ z)
-    big[2, 2] += h * 0.5
-    q, cross, r = big[:2, :2], big[:2, 2:3], big[2:3, 2:3]
-    p, k = np.zeros((2, 2)), np.zeros((1, 2))
-    for _ in range(2000):
-        k = np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a + cross.T)
-        p = q + a.T @ p @ a - (a.T @ p @ b + cross) @ k
-    expected = -(x[:, :2] * k[0, 0] + x[:, 2:] * k[0, 1])
-    torch.testing.assert_close(one.policy(x), expected, rtol=1e-6, atol=1e-9)
+    one_axis = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
+    lqr = adp.LQR(one_axis, adp.QuadraticCost(2.0, 0.5, dim=2, inputs=1), period=0.1)
+    wanted = torch.cat([lqr(x[:, axis::2]) for axis in range(2)], dim=-1)
+    torch.testing.assert_close(one.policy(x), wanted, rtol=1e-6, atol=1e-9)
     assert float(one.policy(1e3 * x).abs().max()) == 3.0  # within its bounds
 
 

@@ -219,18 +219,6 @@ def model_of(**given: Any) -> Any:
     return st.StaFRegressor(**given).partial_fit(tensor([0.0, 0.1]), tensor(1.0))
 
 
-def test_centers_are_directions_in_the_closed_ball() -> None:
-    edge = [[1.0, 1e-9**0.5], [0.0, 0.0]]
-    model = model_of(kernel="matern", centers=edge, radius=0.25)
-    assert torch.equal(model.centers_offsets_, 0.25 * tensor(edge))
-    outside = [[0.0, 0.5], [(1 + 1.5e-9) ** 0.5, 0.0]]
-    for wrong in (outside, [[0.5, 0.5, 0.0]], [0.5, 0.5], [[[0.5, 0.5]]], [[math.nan, 0.0]]):
-        with pytest.raises(
-            ValueError, match=r"centers=...\)` must be directions \(M, 2\) in the closed unit"
-        ):
-            model_of(centers=wrong)
-
-
 def test_what_was_tuned_holds_for_as_many_streams_coordinates_and_outputs_alone() -> None:
     x, y = data(30)
     tuned = st.StaFRegressor(radius=0.4).tune(x, y)

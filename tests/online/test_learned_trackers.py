@@ -148,12 +148,3 @@ def test_full_process_keeps_its_size_and_what_matters() -> None:
     torch.testing.assert_close(
         inverse[kept][:, kept] @ (gram + JITTER * identity), identity, rtol=0, atol=1e-6
     )
-
-
-def test_what_was_learned_fades_to_nothing() -> None:
-    (x, y), models = samples(10), empty(16, outputs=2)
-    learn(models, x, y)
-    learn(models, x[:1] + 100, y[:1], share=1e-12)
-    mean, variance = models.predict(x[3][:, None], RATE, NOISE, JITTER)
-    assert mean.abs().max() < 1e-5
-    torch.testing.assert_close(variance, 1 + JITTER + NOISE)

@@ -183,16 +183,3 @@ def test_of_the_closest_pair_the_one_with_the_closer_second_neighbour_is_given_u
     assert places(memory) == [3.0 if slot == given_up else place for slot, place in enumerate(kept)]
     two = memory_of(0.0, 1.0, capacity=2).add(x, model(x, 9.0))
     assert sorted(each for each in places(two) if each is not None)[-1] == 3.0
-
-
-def test_a_start_is_nothing_where_nothing_is_remembered_and_the_nearest_beyond_a_support() -> None:
-    memory = memory_of(0.0, 0.3, reach=1.0)
-    x = at(0.0, 0.09, 0.15, 0.25)
-    found = memory.start(x)
-    assert found.isnan().all(-1).tolist() == [False, False, True, False]
-    for state, coefficients, value in zip(x, found, (1.0, 1.0, None, 2.0), strict=True):
-        if value is not None:
-            torch.testing.assert_close(coefficients, model(state, value), rtol=1e-6, atol=1e-6)
-            torch.testing.assert_close(memory.start(state), coefficients, rtol=1e-9, atol=1e-9)
-    slope = memory.gradient(at(0.02))
-    torch.testing.assert_close(slope, torch.zeros_like(slope), rtol=0, atol=1e-7)

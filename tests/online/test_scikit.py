@@ -88,16 +88,6 @@ def test_river_adapter_takes_features_by_name() -> None:
     assert np.sqrt(np.mean(np.square(errors[75:]))) < 0.05 * y.std()
 
 
-def test_river_pipelines_take_the_adapter() -> None:
-    compose = pytest.importorskip("river.compose")
-    from river import evaluate, metrics, preprocessing
-
-    x, y = series(100)
-    samples = [({"a": a, "b": b}, value) for (a, b), value in zip(x.tolist(), y.tolist(), strict=True)]
-    model = compose.Pipeline(preprocessing.StandardScaler(), RiverRegressor(MixtureRegressor(128, 8)))
-    assert evaluate.progressive_val_score(samples, model, metrics.MAE()).get() < 0.3 * y.std()
-
-
 def pretend(monkeypatch: pytest.MonkeyPatch, name: str, **names: Any) -> None:
     """A module of another library with these names, which need not be installed."""
     module = types.ModuleType(name)

@@ -98,16 +98,3 @@ def test_a_polynomial_is_found_and_its_rounding_is_enough() -> None:
     torch.testing.assert_close(found.coefficients / size[:, None], exact / size[:, None], rtol=0, atol=1e-12)
     assert bool((found.error < 1e-14 * size).all())
     assert bool((found.lower <= found.error).all())
-
-
-def test_a_number_that_is_none_on_the_grid_is_told_of_its_function_only() -> None:
-    grid = ball_grid(2, 3, 6)
-
-    def function(z: Tensor) -> Tensor:
-        values = z.sum(-1).expand(2, *z.shape[-2:-1]) if z.dim() == 2 else z.sum(-1)
-        broken = (z.norm(dim=-1) == 0).expand_as(values) & tensor([[0.0], [1.0]]).bool()
-        return torch.where(broken, torch.nan, values)
-
-    found = supremum(function, grid, 1.0)
-    assert found[0] == pytest.approx(math.sqrt(2), rel=1e-6)
-    assert math.isnan(found[1])
