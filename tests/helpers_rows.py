@@ -196,6 +196,44 @@ def referred(error: Any = 10.0, gain: Any = 5.0) -> Run:
     )
 
 
+def problem(mass: Any = 1.0, bound: Any = 2.0) -> tuple[systems.Plant, adp.Cost]:
+    """A plant and a cost with bounds of its inputs."""
+    return systems.Pendulum(mass), adp.QuadraticCost(1.0, 1.0, 2, 1, low=-bound, high=bound)
+
+
+def planned(**numbers: Any) -> Run:
+    search = adp.BoxDDP(adp.SampledProblem.of(*problem(**numbers), dt=0.1), steps=4, compile=False)
+    return lambda rows, real: search.solve(X0[rows].to(real))
+
+
+def followed(**numbers: Any) -> Run:
+    sampled = adp.SampledProblem.of(*problem(**numbers), dt=0.1)
+    return loop(adp.RecedingHorizon(sampled, steps=3, iterations=1, compile=False), *problem(**numbers), 0.1)
+
+
+def walled(wall: Any = -0.2, decay: Any = 1.0, bound: Any = 3.0) -> Run:
+    plant, settings = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]]), {"decay": decay, "dt": 0.05}
+    lqr = adp.LQR(plant, COST)
+    safe = adp.SafetyFilter(lqr, plant, lambda x, t: x[:, 0] - wall, low=-bound, high=bound, **settings)
+    return lambda rows, real: safe.restrain(X0[rows].to(real), lqr(X0[rows].to(real)))
+
+
+def centered(radius: Any) -> Run:
+    centers = st.StateFollowingCenters(RINGS, radius)
+    return lambda rows, real: centers(X0[rows].to(real))
+
+
+def streamed(width: Any = 1.0, **settings: Any) -> Run:
+    angle = 0.05 * torch.arange(12.0).unsqueeze(-1) + torch.arange(float(ROWS))
+    x = torch.stack((angle.sin(), 0.7 * angle.sin()), dim=-1)
+
+    def run(rows: slice, real: torch.dtype) -> Any:
+        model = st.StaFRegressor(st.GaussianKernel(width), **settings)
+        return model.fit(x[:, rows].to(real), x[:, rows].to(real).sin().sum(-1)).predict(x[0, rows], True)
+
+    return run
+
+
 def avoided(spot: Any = (1.8,), weight: Any = 1.0, bound: Any = 1.0) -> Run:
     robot, at = systems.Linear([[0.0]], [[1.0]]), torch.as_tensor(spot, dtype=torch.float64)
 
@@ -207,6 +245,22 @@ def avoided(spot: Any = (1.8,), weight: Any = 1.0, bound: Any = 1.0) -> Run:
     return lambda rows, real: tuple(
         adp.plan_around(robot, cost, X0[rows, :1].to(real), dt=0.1, steps=4, **few)[1:]
     )
+
+
+class Spring(systems.ControlAffineSystem):
+    """A user's plant, whose number is a buffer."""
+
+    dim, inputs = 2, 1
+
+    def __init__(self, stiffness: Any) -> None:
+        super().__init__()
+        self.register_buffer("stiffness", torch.as_tensor(stiffness, dtype=torch.float64))
+
+    def drift(self, x: Tensor) -> Tensor:
+        return torch.stack((x[..., 1], -self.get_buffer("stiffness") * x[..., 0] - 0.1 * x[..., 1]), dim=-1)
+
+    def effectiveness(self, x: Tensor) -> Tensor:
+        return torch.tensor([[0.0], [1.0]]).to(x).expand(*x.shape, 1)
 
 
 class Gained(adp.Controller):
@@ -312,6 +366,15 @@ CASES: dict[str, Case] = {
         {"q": (1.0, 2.0), "discount": (0.1, 1.0)},
         lambda q=1.0, discount=0.0: loop(adp.LQR(TWO, adp.QuadraticCost(q, 1.0, 2, 1, discount=discount))),
     ),
+    "lqr of a period": Case(
+        {"mass": (0.5, 2.0), "bound": (1.0, 2.0)}, lambda **n: loop(adp.LQR(*problem(**n), period=0.05))
+    ),
+    "user's plant": Case(
+        {"stiffness": (0.5, 4.0), "q": (1.0, 3.0)},
+        lambda stiffness=1.0, q=1.0: loop(
+            LQR, Spring(stiffness), adp.QuadraticCost(q, 1.0, 2, 1, low=-2.0, high=2.0)
+        ),
+    ),
     "supervised": Case(
         {"trust": (0.3, 0.6)},
         lambda trust: loop(adp.Supervised(adp.Feedback(lambda x: 10 * x[..., 1:]), LQR, COST, trust)),
@@ -336,6 +399,7 @@ CASES: dict[str, Case] = {
         1e-9,
     ),
     "polynomial": Case({"bias": (0.5, 1.0)}, lambda bias: chase(st.PolynomialKernel(3, bias)), 1e-9),
+    "centers": Case({"radius": (0.1, 0.3)}, centered),
     "constant_radius": Case({"radius": (0.1, 0.4)}, lambda radius: chase(radius=radius), 1e-9),
     "state_radius": Case(
         {"radius": (0.3, 0.7), "offset": (0.01, 0.05), "gain": (1.0, 2.0)},
@@ -457,7 +521,27 @@ CASES: dict[str, Case] = {
         lambda **n: drift(**n),
         1e-9,
     ),
+    "stream": Case(
+        {
+            "width": (0.6, 1.2),
+            "radius": (0.3, 0.6),
+            "noise": (0.03, 0.1),
+            "amplitude": (0.8, 1.5),
+            "forgetting": (0.99, 0.999),
+            "follow": (0.5, 1.0),
+            "robust": (2.0, 3.0),
+        },
+        streamed,
+        1e-9,
+    ),
     # what plans and guards
+    "box_ddp": Case({"mass": (0.5, 2.0), "bound": (1.0, 2.0)}, planned),
+    "receding_horizon": Case({"mass": (0.5, 2.0), "bound": (1.0, 2.0)}, followed),
+    "rollout": Case(
+        {"mass": (0.5, 2.0), "bound": (1.0, 2.0)},
+        lambda **n: loop(adp.RolloutPolicy.of_lqr(*problem(**n), steps=3, horizon=0.15)),
+    ),
+    "safety_filter": Case({"wall": (-0.3, 0.1), "decay": (1.0, 3.0), "bound": (2.0, 3.0)}, walled),
     "identifying_tracker": Case({"error": (5.0, 10.0), "gain": (4.0, 5.0)}, referred),
     "changing_plant": Case({"mass": (0.8, 1.2), "before": ([0.8], [1.2]), "after": ([0.4], [0.6])}, changing),
     "robust_filter": Case(

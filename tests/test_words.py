@@ -1,8 +1,7 @@
-"""Plain words: how docstrings and manuals begin and how long their sentences are, and a spell checker."""
+"""Plain words: how long the sentences of manuals are, and a spell checker."""
 
 from __future__ import annotations
 
-import ast
 import re
 import shutil
 import subprocess
@@ -12,7 +11,6 @@ from pathlib import Path
 import pytest
 from command_line import ROOT
 
-RIDDLE = re.compile(r"(What|Whether|Of|As|One|Where|How|The same)\b")
 MANUALS = [
     ROOT / "README.md",
     ROOT / "CHANGELOG.md",
@@ -23,21 +21,6 @@ MANUALS = [
 ]
 MANUALS += sorted((ROOT / "staf_torch").rglob("*.md"))
 SHAPES = re.compile(r"^```.*?^```$|^ {4}.*?$|^\|.*?$|^#.*?$|^!\[.*?$", re.DOTALL | re.MULTILINE)
-
-
-def docstrings(path: Path) -> Iterator[str]:
-    """First lines of all docstrings of a file."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
-            text = ast.get_docstring(node)
-            if text:
-                yield text.partition("\n")[0]
-
-
-def test_docstrings_begin_with_a_subject_and_an_action() -> None:
-    lines = [line for path in (ROOT / "staf_torch").rglob("*.py") for line in docstrings(path)]
-    riddles = [line for line in lines if RIDDLE.match(line)]
-    assert len(riddles) <= 0.02 * len(lines), riddles
 
 
 def sentences(path: Path) -> Iterator[str]:
