@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -13,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 import staf_torch as st
-from staf_torch import adp, envs, lanes, metrics, online, optim, systems, targets
+from staf_torch import adp, lanes, metrics, online, optim, systems, targets
 from staf_torch.centers import Radius
 
 X = torch.tensor([[0.25, 0.125], [-0.25, 0.5], [1.0, -1.0]], dtype=torch.float64)  # exact in float32
@@ -59,6 +58,8 @@ DOORS: dict[str, Callable[[Any], Any]] = {
     "StateFollowingCenters": BASIS.gram,
     "QuadraticCost": lambda x: COST.rate(x, X[:, :1]),
     "Pendulum": lambda x: PLANT.rate(x, X[:, :1]),
+    "Linear": CART.drift,
+    "kernel": lambda x: BASIS.kernel(x, X),
     "hjb_residual": lambda x: adp.hjb_residual(PLANT, COST, square, x),
 }
 with warnings.catch_warnings():  # torch calls both of them prototypes
@@ -81,27 +82,13 @@ REFUSED: dict[str, tuple[Any, str]] = {
 
 @pytest.mark.parametrize("door", list(DOORS))
 def test_what_is_no_state_is_refused_by_argument_and_what_to_write(door: str) -> None:
-    for kind, (given, message) in REFUSED.items():
+    kinds = REFUSED if door not in ("Linear", "kernel") else [*REFUSED][:6]  # of numbers
+    for kind in kinds:
+        given, message = REFUSED[kind]
         with pytest.raises(ValueError, match=message) as caught:
             DOORS[door](given)
         assert str(caught.value).startswith("`"), kind
         assert "=...)`" in str(caught.value), kind
-
-
-NUMBERS = ("integers", "flags", "complex", "an array", "a list", "nothing")
-
-
-@pytest.mark.parametrize("kind", NUMBERS)
-def test_plants_and_kernels_take_floating_point_tensors_alone(kind: str) -> None:
-    given, message = REFUSED[kind]
-    plants = PLANT, CART, systems.TwoState(), systems.CartPole(), systems.ThreeState()
-    for door in (
-        *(plant.drift for plant in plants),
-        lambda x: BASIS.kernel(x, X),
-        lambda x: BASIS.kernel(X, x),
-    ):
-        with pytest.raises(ValueError, match=message):
-            door(given)
 
 
 @pytest.mark.compiled
@@ -112,9 +99,6 @@ def test_a_view_with_a_pending_sign_and_a_spread_row_are_the_numbers_that_they_s
     assert lanes.ready(NEAR, X)
     torch.testing.assert_close(NEAR(negative), NEAR(X), rtol=1e-9, atol=0)
     assert NEAR(X[:1].expand(3, 2)).equal(NEAR(X[:1].repeat(3, 1)))
-    for given, message in REFUSED.values():
-        with pytest.raises(ValueError, match=message):
-            NEAR(given)
 
 
 POLICIES: dict[str, Callable[[], nn.Module]] = {
@@ -135,32 +119,6 @@ def test_float32_states_get_the_control_of_float64_in_float32(name: str) -> None
         found = made(x.float())
         assert found.dtype == torch.float32
         torch.testing.assert_close(found.double(), right, rtol=2e-6, atol=2e-6)
-
-
-@pytest.mark.compiled
-@pytest.mark.needs_compiler
-def test_a_compiled_program_serves_near_optimal_for_float32() -> None:
-    policy = copy.deepcopy(NEAR).float()
-    assert lanes.ready(policy, X.float())
-    found = policy(X.float())
-    assert found.dtype == torch.float32
-    torch.testing.assert_close(found.double(), NEAR(X), rtol=2e-6, atol=0)
-
-
-def test_plans_of_float32_states_are_those_of_float64_in_float32() -> None:
-    search = adp.BoxDDP(PROBLEM, steps=6, compile=False)
-    found, right = search.solve(X.float()), search.solve(X)
-    u, _ = PLANS.step(X.float(), PLANS.init(X.float()), X, 0.05)
-    assert {found.control.dtype, found.cost.dtype, u.dtype} == {torch.float32}
-    torch.testing.assert_close(found.cost.double(), right.cost, rtol=1e-6, atol=0)
-    torch.testing.assert_close(u.double(), PLANS.step(X, PLANS.init(X), X, 0.05)[0], rtol=1e-6, atol=1e-6)
-
-
-@pytest.mark.parametrize("rows", [2, 3, 5, 7])
-def test_constraints_with_a_wall_a_row_are_refused_for_any_number_of_rows(rows: int) -> None:
-    walls = torch.linspace(0.5, 1.5, rows, dtype=torch.float64)
-    with pytest.raises(ValueError, match=r"`SafetyFilter\(constraints=...\)` number 0 .* row's own stand in"):
-        adp.SafetyFilter(LQR, PLANT, lambda x, t: walls - x[:, 0], dt=0.05)
 
 
 @pytest.mark.parametrize("rows", [1, 2, 3, 4])
@@ -215,11 +173,6 @@ class Turned(st.GaussianKernel):
         return super().forward(x1, x2).mT
 
 
-class Gained(st.GaussianKernel):
-    def log_gain(self, x: Tensor) -> Tensor:
-        return x
-
-
 class Mixed(optim.SteepestDescent):
     def step(self, objective: Any, weights: Tensor, state: Any) -> Any:
         return weights + 0.1 * objective.descent(weights).mT, state
@@ -232,13 +185,7 @@ class Sideways(metrics.Metric):
         return result.estimate.mT  # type: ignore[no-any-return]
 
 
-class Rest(Own):
-    def drift(self, x: Tensor) -> Tensor:
-        return super().drift(x).T
-
-
 PAID = r"`Paid.state_rate` must map rows \(5, 2\) to \(5,\), .* as a tensor; got 0.0"
-EPISODE = {"dt": 0.05, "horizon": 1.0, "limit": 9.0, "penalty": 1.0}
 SIX = torch.rand(6, 4, 2, dtype=torch.float64)
 
 
@@ -246,25 +193,21 @@ SIX = torch.rand(6, 4, 2, dtype=torch.float64)
     ("call", "message"),
     [
         (lambda: adp.simulate(LQR, Own(SIX[:3, 0, 0]), COST, X, dt=0.05, steps=2), "`Own.drift` must map"),
-        (lambda: adp.near_optimal(Own(SIX[:5, 0, 0]), COST, dt=0.05), "`Own.drift` must map"),
         (lambda: st.chase(SIX, BASIS, own(6), LAW), "`<lambda>` must map points .* row's own"),
-        (lambda: st.StaF(BASIS, (6,)).fit_(SIX[:, 0], own(6)), "`<lambda>` must map points"),
         (lambda: adp.SampledProblem.of(CART, COST, dt=0.1, terminal=own(2)), r"\(terminal=...\)` must map"),
-        (lambda: adp.QuadraticCost(1.0, 1.0, 2, 1, terminal=own(2)), r"\(terminal=...\)` must map"),
-        (lambda: adp.DirectShooting(CART, COST, horizon=1.0, terminal=own(2)), r"\(terminal=...\)` must map"),
+        (
+            lambda: adp.SafetyFilter(LQR, PLANT, lambda x, t: SIX[:5, 0, 0] - x[:, 0], dt=0.05),
+            r"`SafetyFilter\(constraints=...\)` number 0 .* row's own stand in",
+        ),
         (lambda: adp.hjb_residual(CART, COST, own(3), X), r"\(value=...\)` must map"),
         (lambda: adp.LQR(PLANT, Paid(1.0, 1.0, 2, 1)), PAID),
-        (lambda: adp.simulate(LQR, PLANT, Paid(1.0, 1.0, 2, 1), X, dt=0.05, steps=2), PAID),
         (lambda: adp.simulate(lambda x: x, CART, COST, X, dt=0.05, steps=2), r"to controls \(3, 1\)"),
         (lambda: st.chase(SIX, BASIS, lambda x: x[..., 0] > 0, LAW), "floating point; got torch.bool"),
-        (lambda: BASIS.ideal_weights(X, lambda x: torch.complex(x, x)[..., 0]), "got torch.complex128"),
         (lambda: st.StateFollowingCenters(st.rings(6), Flat()), r"`Flat` must map rows \(5, 2\) to \(5,\)"),
         (lambda: st.StateFollowingCenters(st.rings(6), Whole()), "`Whole` must map each state by itself"),
         (lambda: st.StaFBasis(Turned(), BASIS.centers), "`Turned.forward` must map"),
-        (lambda: st.StaFBasis(Gained(), BASIS.centers), "`Gained.log_gain` must map"),
         (lambda: st.chase(SIX, BASIS, square, Mixed()), "`Mixed.step` must map"),
         (lambda: Sideways().badness(st.chase(SIX[:4], BASIS, square, LAW), None), "`Sideways` must map"),
-        (lambda: envs.Episodes(Rest(SIX[0, 0, 0]), COST, 2, **EPISODE), "`Rest.drift` must map"),
         (lambda: torch.func.vmap(lambda s: st.chase(s, BASIS, square, LAW).estimate)(SIX[None]), "all rows"),
     ],
 )
@@ -300,7 +243,6 @@ U, GAIN = torch.rand(3, 5, dtype=torch.float64), torch.rand(3, dtype=torch.float
         ((X[:, 0], (U, U[:, :2]), (GAIN,)), r"its now1, must have 5 times like `Program\(now=...\)`, its"),
         ((X[:, 0].to("meta"), U, (GAIN,)), r"`Program\(now=...\)` must be on meta like"),
         ((X[:, 0], U.to_sparse(), (GAIN,)), r"`Program\(now=...\)` must be dense"),
-        ((X[:, 0], U.numpy(), (GAIN,)), r"`Program\(now=...\)` must be a tree of tensors"),
         ((X[0, 0], U, (GAIN,)), r"`Program\(carry=...\)` must begin with rows"),
     ],
 )
@@ -324,34 +266,8 @@ def test_a_regressor_reads_no_address_of_a_tensor_without_numbers() -> None:
         fitted = kind().fit(SIX[:, 0].numpy(), SIX[:, 0, 0].numpy())
         right = fitted.predict(X[0])
         assert fitted.predict(torch.complex(0 * X[0], -X[0]).conj().imag).equal(right)
-        assert fitted.predict(torch.complex(0 * X[:1], -X[:1]).conj().imag).equal(right.unsqueeze(0))
-        for given, message in (
-            (X[0].to("meta"), "meta"),
-            (NESTED, "got one that is nested"),
-            (torch.tensor(1.0), "at least 1 dim"),
-        ):
+        for given, message in ((X[0].to("meta"), "meta"), (NESTED, "got one that is nested")):
             with pytest.raises(ValueError, match=message):
                 fitted.predict(given)
         with pytest.raises(ValueError, match=r"predict\(x=...\)` must hold all samples at once"):
             torch.func.vmap(fitted.predict)(X)
-        torch.set_default_device("meta")
-        try:
-            assert math.isclose(fitted.predict(X[0].numpy()), float(right), rel_tol=1e-12)
-        finally:
-            torch.set_default_device(None)
-
-
-def test_designs_and_plans_are_made_beside_their_states_under_any_default_device() -> None:
-    right = adp.BoxDDP(PROBLEM, steps=6).solve(X).cost
-    torch.set_default_device("meta")
-    try:
-        cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
-        problem = adp.SampledProblem.of(systems.Pendulum(), cost, dt=0.05)
-        found = adp.BoxDDP(problem, steps=6).solve(X).cost
-        control = adp.RolloutPolicy.of_lqr(PLANT, cost, steps=4, horizon=0.2)(X)
-        loop = adp.simulate(adp.LQR(PLANT, cost), PLANT, cost, X, dt=0.05, steps=4).cost
-    finally:
-        torch.set_default_device(None)
-    torch.testing.assert_close(found, right, rtol=1e-9, atol=0)
-    torch.testing.assert_close(control, ROLLOUT.control(X), rtol=1e-9, atol=1e-12)
-    assert loop.equal(adp.simulate(LQR, PLANT, COST, X, dt=0.05, steps=4).cost)

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-import pytest
 import torch
 from torch import Tensor
 
@@ -32,8 +31,10 @@ def calls() -> dict[str, Callable[[], Tensor]]:
     regressors = [
         kind().fit(STATES[0], STATES[0].sum(-1)) for kind in (st.StaFRegressor, online.MixtureRegressor)
     ]
+    problem = adp.SampledProblem.of(PLANT, COST, dt=0.05)
     return {
         "policy": lambda: made(X),
+        "plan": lambda: adp.BoxDDP(problem, steps=2, compile=False).solve(X).control,
         "chase": lambda: (
             st.chase(STATES, basis, lambda x: x.square().sum(-1), optim.SteepestDescent()).estimate
         ),
@@ -52,18 +53,13 @@ def default_device(name: str) -> Iterator[None]:
         torch.set_default_device(None)
 
 
-@pytest.fixture(scope="module")
-def made() -> dict[str, Callable[[], Tensor]]:
-    return calls()
-
-
-@pytest.mark.parametrize("name", ["policy", "simulation", "program", "StaFRegressor", "MixtureRegressor"])
-def test_a_default_device_reaches_no_compiled_call(made: dict[str, Callable[[], Tensor]], name: str) -> None:
-    expected = made[name]()
+def test_a_default_device_reaches_no_call_and_nothing_that_is_made() -> None:
+    expected = {name: (call, call()) for name, call in calls().items()}
     with default_device("meta"):
-        found = made[name]()
-    assert found.device.type == "cpu"
-    assert found.equal(expected)
+        for name, call in calls().items():
+            for found in (call(), expected[name][0]()):
+                assert found.device.type == "cpu", name
+                assert found.equal(expected[name][1]), name
 
 
 def test_a_program_compiled_under_a_default_device_is_that_of_the_inputs_device() -> None:
