@@ -94,7 +94,7 @@ def sweep(*overrides: str, directory: str | Path | None = None) -> Runs:
     sweep that was interrupted.
 
     Example:
-        >>> runs = sweep("kernel=gaussian,matern", "centers.radius=0.1,0.2", "duration=6.0", "figures=false")
+        >>> runs = sweep("kernel=gaussian,matern", "centers.radius=0.1,0.2", "duration=5.5", "figures=false")
         >>> runs
         <Runs 4 completed, over kernel, centers.radius>
         >>> runs.best("ball_error").setting("centers.radius")

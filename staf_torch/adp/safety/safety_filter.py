@@ -102,7 +102,7 @@ class SafetyFilter(Controller, DecidedByRows):
         >>> wall = adp.SafetyFilter(lqr, plant, lambda x, t: x[:, 0] + 0.1, dt=0.01, low=-3.0, high=3.0)
         >>> x0 = torch.tensor([[2.0, -1.0]]).double()
         >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
-        >>> run = adp.simulate(wall, plant, cost, x0, steps=100)
+        >>> run = adp.simulate(wall, plant, cost, x0, steps=60)
         >>> wall.report(run)["constraint_violations"], wall.report(run)["infeasible"]
         (0, [])
 

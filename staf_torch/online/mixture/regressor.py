@@ -239,8 +239,8 @@ class MixtureRegressor(StreamEstimator):
     NaN is not learned. Any finite number is survived: a stream that jumps starts afresh there.
 
     Example:
-        >>> model = MixtureRegressor(memory=200, neighbours=16)
-        >>> x = torch.linspace(0.0, 9.0, 90, dtype=torch.float64).sin()
+        >>> model = MixtureRegressor(memory=200, neighbours=8)
+        >>> x = torch.linspace(0.0, 3.0, 30, dtype=torch.float64).sin()
         >>> model.fit(x[:-1, None], x[1:]).predict(x[-1:]).shape
         torch.Size([])
 

@@ -36,13 +36,13 @@ starts = torch.tensor([[-1.0, 1.0], [1.0, 1.0], [0.5, -1.0], [-1.0, -0.5]]).doub
 def spends(logarithms):
     gains = adp.Gains(*logarithms.exp())  # of the critic, its extrapolation, the actor, its decay, 1/s
     learner = adp.ActorCritic(basis, plant, cost, points, adp.Information(gains))
-    return adp.simulate(learner, plant, cost, starts, dt=0.005, steps=1000).cost.mean()
+    return adp.simulate(learner, plant, cost, starts, dt=0.005, steps=400).cost.mean()
 
 
 at = torch.tensor([0.001, 0.25, 1.2, 0.01]).double().log().requires_grad_()
 loss, length = spends(at), 0.3
 spent, (slope,) = [loss.item()], torch.autograd.grad(loss, at)
-for _ in range(12):
+for _ in range(8):
     further = (at - length * slope / slope.norm()).detach().requires_grad_()
     tried = spends(further)
     if tried < loss:  # which a cost that is NaN is not
@@ -52,10 +52,10 @@ for _ in range(12):
         length = 0.5 * length
     spent.append(loss.item())
 print(at.exp().tolist(), f"cost {spent[0]:.3f} before, {spent[-1]:.3f} after")
-assert spent[-1] < 0.88 * spent[0]
+assert spent[-1] < 0.95 * spent[0]
 
 # %%
-known = adp.simulate(adp.LQR(plant, cost), plant, cost, starts, dt=0.005, steps=1000).cost.mean()
+known = adp.simulate(adp.LQR(plant, cost), plant, cost, starts, dt=0.005, steps=400).cost.mean()
 figure, axes = plt.subplots(figsize=(3.4, 2.4), layout="constrained")
 axes.plot(spent, label="learns, with these gains")
 axes.axhline(known, linestyle=":", color="0.2", label="the LQR, which knows the plant")
@@ -67,7 +67,7 @@ axes.legend()
 
 # %%
 found = run(
-    "experiment=learn_kernel", "duration=2", "settle_time=1", "centers.count=3", "learn_kernel.steps=20"
+    "experiment=learn_kernel", "duration=2", "settle_time=1", "centers.count=3", "learn_kernel.steps=10"
 )
 print(found.metrics)
 assert found.metrics["learned_error"] < found.metrics["start_error"]

@@ -73,7 +73,7 @@ class DirectShooting:
         >>> x0 = torch.tensor([[0.2, 0.1]]).double()
         >>> round(float(adp.DirectShooting(plant, cost).solve(x0).value), 5)  # V* = x1^2 / 2 + x2^2
         0.03
-        >>> limited = adp.DirectShooting(plant, cost, low=-0.1, high=0.1)
+        >>> limited = adp.DirectShooting(plant, cost, low=-0.1, high=0.1, horizon=1.0)
         >>> limited.solve(x0).plan.abs().max() <= 0.1
         tensor(True)
 

@@ -17,7 +17,7 @@ class Optimum(NamedTuple):
     Example:
         >>> plant = systems.TwoState()
         >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
-        >>> found = adp.DirectShooting(plant, cost).solve(torch.tensor([[0.2, 0.1]]).double())
+        >>> found = adp.DirectShooting(plant, cost, horizon=2.0).solve(torch.tensor([[0.2, 0.1]]).double())
         >>> bool(found.converged.all()), bool(found.mesh_error.max() < 1e-4)
         (True, True)
 
