@@ -100,7 +100,7 @@ def together(count: int, work: Callable[[int], object]) -> None:
 
 
 def crowd(shared: Crowded, times: int) -> None:
-    """Ask from four threads what one was told before, and then ask and learn beside each other."""
+    """Ask from four threads what one was told before; then ask and learn, losing nothing."""
     made = shared.make()
     told = [shared.ask(made, k) for k in range(8)]
 
@@ -111,6 +111,7 @@ def crowd(shared: Crowded, times: int) -> None:
     together(4, ask)
     if (learn := shared.learn) is None:
         return
+    before = _samples(made)
 
     def both(number: int) -> None:
         for k in range(times):
@@ -118,3 +119,9 @@ def crowd(shared: Crowded, times: int) -> None:
             assert not isinstance(found, Tensor) or bool(found.isfinite().all())
 
     together(4, both)
+    assert before is None or _samples(made) == before + 2 * times
+
+
+def _samples(model: Any) -> int | None:
+    """What it has learned from or left out; None of what does not count."""
+    return int(model.n_samples_seen_ + model.n_skipped_) if hasattr(model, "n_skipped_") else None

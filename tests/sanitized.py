@@ -5,8 +5,8 @@
 Row programs (a chase is one), filters of streams and banks of local models are built with both sanitizers,
 shared by four threads that ask and learn, and called with shapes, layouts and dtypes drawn at random: 0 and 1
 rows and times, strided, transposed, expanded and misaligned tensors, and inputs that must be refused. A bad
-read, a bad write or undefined behaviour ends the process; what is returned is compared with plain torch. In
-the end a read outside is made on purpose, which has to be found.
+read, a bad write or undefined behaviour ends the process; what programs return is compared with plain torch.
+In the end a read outside is made on purpose, which has to be found.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def inside(calls: int, seed: int, chosen: Sequence[str]) -> None:
     from staf_torch import lanes
     from staf_torch.online import StaFRegressor
     from staf_torch.online.mixture.regressor import Bank
-    from staf_torch.online.mixture.rules import RECENT, BankShape, Rules
+    from staf_torch.online.mixture.rules import RECENT, BankShape
 
     chance = random.Random(seed)
     torch.manual_seed(seed)
@@ -146,29 +146,16 @@ def inside(calls: int, seed: int, chosen: Sequence[str]) -> None:
         assert torch.as_tensor(predicted).shape[: len(shape) - 2] == shape[1:-1]
 
     def a_bank() -> None:
-        """Some samples for some streams, of which some go on; compiled code against the definition."""
+        """Some samples for some streams, of which some go on."""
         streams, steps = chance.choice((0, 1, 1, 2, 3)), chance.choice((0, 1, 2, 12, 70))
         shape = BankShape(dim=2, outputs=1, capacity=RECENT, neighbours=3)
-        bank, plain = Bank(shape, streams, chance.random() < 0.5), None
-        # A Gram matrix of k + 1 points has at most this condition, by which rounding may grow.
-        condition = (shape.neighbours + 1) / min(Rules.of(shape.dim, bank.scaling, None).noise)
-        rounding = condition * torch.finfo(torch.float64).eps
-        if chance.random() < 0.1:
-            plain = Bank(shape, streams, bank.scaling, compile=False)
+        bank = Bank(shape, streams, chance.random() < 0.5)
         for at in range(steps):
-            x = torch.rand(bank.count, 2, dtype=torch.float64)
-            x = x * chance.choice([1e-300, 1.0, 1e150]) if plain is None else x  # there rounding decides
+            x = torch.rand(bank.count, 2, dtype=torch.float64) * chance.choice([1e-300, 1.0, 1e150])
             y = torch.rand(bank.count, 1, dtype=torch.float64) * chance.choice([1.0, 1.0, float("inf")])
-            lapse = chance.choice([None, torch.rand(bank.count, dtype=torch.float64)])
-            bank.learn(x, y, lapse)
-            found = bank.predict(x)
-            if plain is not None and bank.count and at < 12:
-                plain.learn(x, y, lapse)
-                for one, other in zip(found, plain.predict(x), strict=True):
-                    torch.testing.assert_close(one, other, rtol=rounding, atol=rounding, equal_nan=True)
-            if plain is not None:
-                plain.table.copy_(bank.table)  # a step from equal states: rounding does not add up
-            if plain is None and at == 5:
+            bank.learn(x, y, chance.choice([None, torch.rand(bank.count, dtype=torch.float64)]))
+            bank.predict(x)
+            if at == 5:
                 bank.keep(torch.arange(bank.count)[1:])
                 bank.add(2)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -34,53 +35,30 @@ class Addition(NamedTuple):
         return {*self.files, "tests/variants.py"}
 
 
+OWN = ROOT / "tests" / "examples" / "own"
+
+
+def own(name: str) -> str:
+    """A user's class of `tests/examples/own`, with the imports of its room."""
+    text = (OWN / f"{name}.py").read_text(encoding="utf-8")
+    return re.sub(r"^from staf_torch(\.\w+)? import", "from .base import", text, flags=re.MULTILINE)
+
+
 ADDITIONS = {
     "kernel": Addition(
         {
-            "staf_torch/kernels/cauchy.py": '''"""The Cauchy kernel."""
-
-from torch import Tensor
-
-from .radial import RadialKernel
-
-
-class CauchyKernel(RadialKernel):
-    """k(y, c) = 1 / (1 + |y - c|^2 / length_scale^2)."""
-
-    def profile(self, s: Tensor) -> Tensor:
-        return 1 / (1 + s)
-''',
-            "conf/kernel/cauchy.yaml": "_target_: staf_torch.kernels.CauchyKernel\nlength_scale: 1.0\n",
+            "staf_torch/kernels/cauchy.py": own("cauchy"),
+            "conf/kernel/cauchy.yaml": "_target_: staf_torch.kernels.Cauchy\nwidth: 1.0\n",
         },
         (
             "KERNELS",
-            '"cauchy": KernelCase(lambda: st.kernels.CauchyKernel(0.7), '
+            '"cauchy": KernelCase(lambda: st.kernels.Cauchy(0.7), '
             "lambda y, c: 1 / (1 + (distance(y, c) / 0.7) ** 2)),",
         ),
     ),
     "law": Addition(
         {
-            "staf_torch/optim/cautious.py": '''"""Half of the steps that `FixedStep` takes."""
-
-from torch import Tensor
-
-from ..numerics.checks import positive_real
-from .base import LawState, UpdateLaw
-from .fixed_step import over_lipschitz
-from .objective import Objective
-
-
-class Cautious(UpdateLaw):
-    """a <- a + s g / L."""
-
-    needs = frozenset({"extremes"})
-
-    def __init__(self, share: float = 0.5) -> None:
-        self.share = positive_real("Cautious", "share", share)
-
-    def step(self, objective: Objective, weights: Tensor, state: LawState) -> tuple[Tensor, LawState]:
-        return weights + self.share * over_lipschitz(objective, objective.descent(weights)), state
-''',
+            "staf_torch/optim/cautious.py": own("cautious"),
             "conf/optimizer/cautious.yaml": "_target_: staf_torch.optim.Cautious.from_settings\n"
             "share: 0.5\ninner_steps: 10\n",
         },
@@ -88,37 +66,10 @@ class Cautious(UpdateLaw):
     ),
     "plant": Addition(
         {
-            "staf_torch/systems/duffing.py": '''"""The forced Duffing oscillator."""
-
-import torch
-from torch import Tensor
-
-from ..numerics.checks import real
-from .base import ControlAffineSystem, Units
-
-
-class Duffing(ControlAffineSystem):
-    """x1' = x2,  x2' = -stiffness x1 - x1^3 - x2 + u."""
-
-    dim = 2
-    inputs = 1
-    units = Units("m, m/s", "N")
-
-    def __init__(self, stiffness: float = 1.0) -> None:
-        super().__init__()
-        self.stiffness = real("Duffing", "stiffness", stiffness)
-
-    def drift(self, x: Tensor) -> Tensor:
-        x1, x2 = x.unbind(-1)
-        return torch.stack((x2, -self.stiffness * x1 - x1**3 - x2), dim=-1)
-
-    def effectiveness(self, x: Tensor) -> Tensor:
-        zero = torch.zeros_like(x[..., 0])
-        return torch.stack((zero, zero + 1), dim=-1).unsqueeze(-1)
-''',
-            "conf/system/duffing.yaml": "_target_: staf_torch.systems.Duffing\nstiffness: 1.0\n",
+            "staf_torch/systems/trolley.py": own("trolley"),
+            "conf/system/trolley.yaml": "_target_: staf_torch.systems.Trolley\nmass: 1.0\n",
         },
-        ("PLANTS", '"duffing": systems.Duffing,'),
+        ("PLANTS", '"trolley": systems.Trolley,'),
     ),
     "controller": Addition(
         {
@@ -152,10 +103,10 @@ class Damping(Feedback):
     ),
 }
 RUNS = {
-    "kernel": ("kernel=cauchy", "kernel.length_scale=0.8"),
+    "kernel": ("kernel=cauchy", "kernel.width=0.8"),
     "law": ("optimizer=cautious", "optimizer.share=0.7"),
-    "plant": ("system=duffing", "system.stiffness=2"),
-    "controller": ("experiment=adp", "adp/policy=damping", "adp.compile=false", "system=duffing", "dt=0.01"),
+    "plant": ("system=trolley", "system.mass=2"),
+    "controller": ("experiment=adp", "adp/policy=damping", "adp.compile=false", "system=trolley", "dt=0.01"),
 }
 PROPERTIES = ("test_variants.py", "test_modules.py", "test_rules.py", "kernels/test_kernels.py")
 PROGRAM = """
@@ -192,7 +143,7 @@ def test_each_has_the_properties_an_option_of_the_command_of_the_schema_and_of_t
         assert len(addition.write(tmp_path)) == 3
     short = ("duration=0.05", "settle_time=0", "figures=false")
     lines = [[*short, *words, f"hydra.run.dir=runs/{name}"] for name, words in RUNS.items()]
-    selected = " or ".join(("auchy", "autious", "uffing", "amping", "listed", "known_here"))
+    selected = " or ".join(("auchy", "autious", "rolley", "amping", "listed", "known_here"))
     properties = [str(Path("tests", name)) for name in PROPERTIES]
     given = f"LINES, SELECTED, PROPERTIES = {lines!r}, {selected!r}, {properties!r}"
     env = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (tmp_path, tmp_path / "staf_torch/plugins")))}
@@ -204,6 +155,6 @@ def test_each_has_the_properties_an_option_of_the_command_of_the_schema_and_of_t
     assert int(found["tests"].split(" passed")[0].split()[-1]) > 40
     rows = json.loads(found["table"])
     assert len(rows) == len(RUNS)
-    assert {"cauchy", "cautious", "duffing", "damping"} <= {str(v) for row in rows for v in row.values()}
-    assert all(key in found["schema"] for key in ("CauchyKernel", "Cautious", "systems.Duffing", "Damping"))
-    assert {"CauchyKernel", "Cautious", "Duffing"} <= set(found["names"])
+    assert {"cauchy", "cautious", "trolley", "damping"} <= {str(v) for row in rows for v in row.values()}
+    assert all(key in found["schema"] for key in ("kernels.Cauchy", "Cautious", "systems.Trolley", "Damping"))
+    assert {"Cauchy", "Cautious", "Trolley"} <= set(found["names"])

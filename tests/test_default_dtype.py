@@ -8,14 +8,13 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-import pytest
 import torch
 from composing import settings
 from helpers import basis_of
 from helpers_chase import BASES, LAW, circles
 from test_modules import MODULES, X
 from torch import Tensor, nn
-from variants import COSTS, DESCENDING, KERNELS, LAYOUTS, PLANTS, PREDICTORS, RADII, TARGETS
+from variants import DESCENDING, KERNELS, LAYOUTS, PLANTS, PREDICTORS, TARGETS, over
 
 import staf_torch as st
 from staf_torch import adp, optim, predictors, systems, theory
@@ -58,12 +57,9 @@ def shooting() -> Any:
     return [(each.knots, each.until) for each in guesses(cost, adp.LQR(plant, cost), X, 3.0, 4, seed=1)]
 
 
-def chased(
-    law: optim.UpdateLaw, predictor: predictors.Predictor | None = None, basis: str = "gaussian"
-) -> Any:
-    found = st.chase(
-        circles(2, 6), BASES[basis], TARGETS["paper"][0](), law, inner_steps=2, predictor=predictor
-    )
+def chased(law: optim.UpdateLaw, predictor: predictors.Predictor | None = None) -> Any:
+    target = TARGETS["paper"][0]()
+    found = st.chase(circles(2, 6), BASES["gaussian"], target, law, inner_steps=2, predictor=predictor)
     return vars(found) if hasattr(found, "__dict__") else tuple(found)
 
 
@@ -82,57 +78,34 @@ def learned() -> Any:
     return st.StaFRegressor().fit(STREAM, STREAM[:, 0] ** 2 + STREAM[:, 1]).predict(STREAM[-1])
 
 
-def tuned() -> Any:
-    return tuple(st.StaFRegressor().tune(STREAM[:30], STREAM[:30, 0] ** 2).tuning)
-
-
-def rated(name: str) -> Any:
-    cost = COSTS[name]()
-    return cost.rate(torch.nn.functional.pad(X, (0, cost.dim - 2)), X[:, :1])
-
-
 THINGS: dict[str, Callable[[], Any]] = {
     **{f"module {k}": lambda c=c: (m := c.make(0.9), c.call(m, X)) for k, c in MODULES.items()},
     **{f"directions {k}": c.make for k, c in LAYOUTS.items() if c.dim < 4},
-    **{
-        f"radius {k}": lambda m=m: st.StateFollowingCenters(st.rings(3), m())(X)
-        for k, (m, _) in RADII.items()
-    },
     **{f"weights {k}": lambda k=k: basis_of(k).ideal_weights(X, TARGETS["paper"][0]()) for k in KERNELS},
-    **{f"target {k}": lambda m=m: m()(X) for k, (m, _) in TARGETS.items()},
     **{f"law {k}": lambda law=law: chased(law) for k, law in DESCENDING.items()},
     **{f"predictor {k}": lambda p=p: chased(LAW, p) for k, p in PREDICTORS.items()},
-    **{f"basis {k}": lambda k=k: chased(LAW, None, k) for k in BASES},
     **{f"plant {k}": lambda k=k: held(k) for k in PLANTS},
-    **{f"cost {k}": lambda k=k: rated(k) for k in COSTS},
     **{f"states of {k}": lambda c=c: (c.goal(), c.states(4, 1), c.cost()) for k, c in CASES.items()},
     "guesses": shooting,
     "stream": learned,
-    **{
-        kind: lambda k=kind: avoidance.scenarios(
-            settings("experiment=avoidance", "trajectories=3", f"avoidance.vehicle={k}")
-        )
-        for kind in ("mass", "unicycle")
-    },
-    "motion": lambda: systems.simulate(systems.VanDerPol(), X, dt=0.05, steps=5),
+    "scenarios": lambda: avoidance.scenarios(settings("experiment=avoidance", "trajectories=3")),
     "minimal count": lambda: theory.minimal_count(
         TARGETS["paper"][0](), st.ExponentialKernel(), X, radius=0.3, epsilon=1e-2
     ),
-    "tuned stream": tuned,
     "sensitivity": lambda: (
         st.StaF(basis_of("gaussian"), (3,)).fit_(X, TARGETS["paper"][0]()).hessian(X[:, None])
     ),
 }
 
 
-@pytest.mark.parametrize("name", list(THINGS))
+@over(THINGS)
 def test_no_number_depends_on_the_default_dtype(name: str) -> None:
-    torch.manual_seed(0)
-    with default(torch.float32):
-        single = list(numbers(THINGS[name]()))
-    torch.manual_seed(0)
-    with default(torch.float64):
-        double = list(numbers(THINGS[name]()))
+    found = []
+    for dtype in (torch.float32, torch.float64):
+        torch.manual_seed(0)
+        with default(dtype):
+            found.append(list(numbers(THINGS[name]())))
+    single, double = found
     assert len(single) == len(double) > 0
     for one, two in zip(single, double, strict=True):
         assert one.dtype == two.dtype

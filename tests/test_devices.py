@@ -24,7 +24,6 @@ from variants import (
     RADII,
     TARGETS,
     VALUE_BASES,
-    by_turns,
     over,
 )
 
@@ -60,50 +59,8 @@ def controllers(plant: Any, cost: Any) -> dict[str, Any]:
     return found
 
 
-def test_a_closed_loop_is_where_its_states_are() -> None:
-    def problem() -> tuple[Any, Any]:
-        return systems.TwoState(), adp.QuadraticCost(1.0, 1.0, 2, 1, low=-5.0, high=5.0)
-
-    plain, (plant, cost) = controllers(*problem()), problem()
-    moved = plant.to(DEVICE), cost.to(DEVICE)
-    for k, (name, controller) in enumerate(controllers(*moved).items()):
-        with lanes.compiling("never"):
-            wanted = adp.simulate(plain[name], *problem(), X0, dt=0.01, steps=2)
-            given = (controller, *moved) if k % 2 else (plain[name], *problem())  # made there, or here
-            found = adp.simulate(given[0], *given[1:], there(X0), dt=0.01, steps=2)
-        agree(found.state, wanted.state)
-        agree(found.cost, wanted.cost)
-
-
-@over(PLANTS)
-def test_a_plant_and_its_trajectories_follow_the_states(name: str) -> None:
-    plant = PLANTS[name]()
-    assert plant.dim is not None
-    x0 = 0.1 * torch.ones(2, plant.dim, dtype=torch.float64)
-    wanted = systems.simulate(plant, x0, dt=0.01, steps=2)
-    moved = PLANTS[name]().to(DEVICE)
-    made_here = systems.simulate(plant, there(x0), dt=0.01, steps=2)
-    agree(made_here, wanted)
-    agree(systems.simulate(moved, there(x0), dt=0.01, steps=2), wanted)
-    agree(moved.linearisation().matrix, plant.linearisation().matrix)
-
-
-@pytest.mark.parametrize(("kernel", "law"), by_turns(KERNELS, list(LAWS)))
-def test_a_chase_follows_the_states(kernel: str, law: str) -> None:
-    states = systems.simulate(systems.Oscillator(), X0, dt=0.05, steps=3)
-    predictor = PREDICTORS["secant"] if law == "steepest descent" else None
-
-    def chased(x: Tensor) -> Tensor:
-        centers = st.StateFollowingCenters(st.rings(6), st.StateRadius(0.4, 0.01))
-        basis = st.StaFBasis(KERNELS[kernel].make(), centers).to(x.device)
-        return st.chase(x, basis, targets.Paper(), LAWS[law], predictor=predictor).estimate
-
-    agree(chased(there(states)), chased(states))
-
-
 WIDTHS = torch.linspace(0.5, 1.5, 2, dtype=torch.float64)
 REGRESSORS: dict[str, Callable[[Tensor, Tensor], Any]] = {
-    "filter": lambda x, y: st.StaFRegressor(),
     "tuned, by numbers of a stream's own": lambda x, y: st.StaFRegressor(
         st.GaussianKernel(st.rows(WIDTHS)), noise=st.rows(WIDTHS), count=3
     ).tune(x, y),
@@ -113,13 +70,13 @@ REGRESSORS: dict[str, Callable[[Tensor, Tensor], Any]] = {
 
 @pytest.mark.parametrize("name", REGRESSORS)
 def test_streams_take_samples_of_a_device_and_a_copy_goes_on_there(name: str) -> None:
-    angle = torch.arange(4, dtype=torch.float64).unsqueeze(-1) + torch.arange(2)
+    angle = torch.arange(3, dtype=torch.float64).unsqueeze(-1) + torch.arange(2)
     x = torch.stack((angle.cos(), angle.sin()), -1)
 
     def predicted(x: Tensor) -> list[Tensor]:
         y = x.sum(-1)
         model = REGRESSORS[name](x, y)
-        found = [copy.deepcopy(model.fit(x, y)).partial_fit(x[0], y[0]).predict(x[3])]
+        found = [copy.deepcopy(model.fit(x, y)).partial_fit(x[0], y[0]).predict(x[2])]
         return [*found, model.forecast(x, y).mean] if hasattr(model, "forecast") else found
 
     for one, other in zip(predicted(there(x)), predicted(x), strict=True):
@@ -136,7 +93,7 @@ def test_a_design_of_a_device_is_that_of_the_cpu() -> None:
     )
 
 
-@pytest.mark.parametrize(("name", "duration"), [("gradient_chase", 1.0), ("faults", 0.2), ("icl", 0.15)])
+@pytest.mark.parametrize(("name", "duration"), [("gradient_chase", 0.5), ("icl", 0.1)])
 def test_an_experiment_runs_on_a_device_with_the_numbers_of_the_cpu(
     name: str, duration: float, tmp_path: Path
 ) -> None:
@@ -194,26 +151,6 @@ def test_planners_and_memories_that_were_made_on_the_cpu_take_states_of_a_device
     assert "`.to('lazy:0')` before compute there" in caplog.text
 
 
-def test_a_memory_of_local_models_is_where_the_first_of_them_was() -> None:
-    basis = st.StaFBasis(st.GaussianKernel(), st.StateFollowingCenters(st.rings(6), 0.1))
-
-    def filled(x: Tensor) -> st.ExperienceMemory:
-        memory = st.ExperienceMemory(basis, 2)
-        for point in x:
-            memory.add(point, basis.local(point).fit(basis.values(point, targets.Paper())))
-        return memory
-
-    x = torch.cat((X0, 2 * X0[:1], X0[:1] + 0.07))
-    one, other = filled(there(x)), filled(x)
-    agree(one(there(x)), other(x))
-    agree(one.start(there(x)), other.start(x))
-    agree(one.gradient(there(x)), other.gradient(x))
-    with pytest.raises(ValueError, match=r"`ExperienceMemory.query\(y=...\)` must be on lazy:0"):
-        one(x)
-    with pytest.raises(ValueError, match=r"`ExperienceMemory.add\(x=...\)` must be on cpu"):
-        other.add(there(x[0]), there(torch.zeros(6, dtype=torch.float64)))
-
-
 # The meta device: shapes, dtypes and structure of what a call returns, and nothing is computed.
 
 META = torch.device("meta")
@@ -250,14 +187,14 @@ def evaluated(x: Tensor, kernel: str, radius: str, target: str) -> Any:
     return fitted(y), fitted.weights, *slopes, *bent, basis.gram(x), basis.excess(weights, x, function)
 
 
-def chased(x: Tensor, law: str, kernel: str, predictor: str, times: int = 20) -> Any:
+def chased(x: Tensor, law: str, kernel: str, predictor: str, times: int = 5) -> Any:
     states, basis = x.unsqueeze(1).expand(-1, times, -1), around(x, kernel, "shrinking")
     more: dict[str, Any] = {"predictor": PREDICTORS[predictor]}
     result = st.chase(states, basis, targets.Paper(), LAWS[law], certificate=True, **more)
     return result, st.chase_weights(states, basis, targets.Paper(), LAWS[law], history=False, **more)
 
 
-def moving(x: Tensor, name: str, steps: int = 20) -> Any:
+def moving(x: Tensor, name: str, steps: int = 4) -> Any:
     plant = PLANTS[name]().to(x.device)
     start = x.new_full((3, plant.equilibrium().numel()), 0.1)
     cost = adp.QuadraticCost(1.0, 1.0, start.shape[1], plant.inputs).to(x.device)
@@ -270,21 +207,21 @@ def paid(x: Tensor, name: str) -> Tensor:
     return cost.rate(x.new_ones(3, cost.dim), x.new_ones(3, cost.inputs))
 
 
-def streamed(x: Tensor, name: str) -> Any:
-    states = x.expand(7, -1, -1)
+def streamed(x: Tensor) -> Any:
+    states = x.expand(3, -1, -1)
     y = states.sum(-1)
-    model = REGRESSORS[name](states, y).fit(states, y).partial_fit(x, y[0], lapse=0.5)
+    model = st.StaFRegressor(count=3).fit(states, y).partial_fit(x, y[0], lapse=0.5)
     return model.predict(x, return_std=True), model.forecast(states, y).mean, model.smooth(states, y)
 
 
 def looped(x: Tensor, name: str) -> Any:
     plant, cost = systems.TwoState(), adp.QuadraticCost(1.0, 1.0, 2, 1, low=-5.0, high=5.0)
     controller = controllers(plant, cost)[name]
-    kept = adp.simulate(controller, plant, cost, x, dt=0.01, steps=4, every=2)
+    kept = adp.simulate(controller, plant, cost, x, dt=0.01, steps=2)
     assert not any(each.is_meta for each in (*plant.buffers(), *cost.buffers()))
     if isinstance(controller, adp.Controller):  # and where all of it is on the device
         controller, plant, cost = (copy.deepcopy(part).to(x.device) for part in (controller, plant, cost))
-    return kept, adp.simulate(controller, plant, cost, x, dt=0.01, steps=4, every=2)
+    return kept, adp.simulate(controller, plant, cost, x, dt=0.01, steps=2)
 
 
 def turns(*tables: Any) -> list[tuple[str, ...]]:
@@ -304,9 +241,7 @@ def held(x: Tensor, policy: str) -> Any:
 
 
 BASES = turns(("gaussian", "matern12"), RADII, TARGETS)[:4]
-CHASES = turns(("steepest descent", "heavy ball", "conjugate gradient", "exact"), ("gaussian",), PREDICTORS)[
-    :4
-]
+CHASES = [*turns(LAWS, KERNELS, ("none", "secant")), ("exact", "gaussian", "tangent, order 2")]
 LOOPS = list(controllers(systems.TwoState(), adp.QuadraticCost(1.0, 1.0, 2, 1)))
 FORMAL: dict[str, Callable[[Tensor], Any]] = {
     **{f"basis of {', '.join(c)}": lambda x, c=c: evaluated(x, *c) for c in BASES},
@@ -314,7 +249,7 @@ FORMAL: dict[str, Callable[[Tensor], Any]] = {
     **{f"plant {name}": lambda x, n=name: moving(x, n) for name in PLANTS},
     **{f"cost {name}": lambda x, n=name: paid(x, n) for name in COSTS},
     **{f"value basis {name}": lambda x, n=name: VALUE_BASES[n]().to(x.device)(x, x) for name in VALUE_BASES},
-    "stream": lambda x: streamed(x, "filter"),
+    "stream": streamed,
     **{f"loop with {name}": lambda x, n=name: looped(x, n) for name in LOOPS},
     **{f"policy {name}": lambda x, n=name: held(x, n) for name in ("a filter", "near_optimal")},
 }
@@ -342,26 +277,6 @@ def test_on_the_meta_device_a_million_steps_are_one() -> None:
     assert (slope.shape, slope.device) == (x.shape, META)
 
 
-def test_on_the_meta_device_a_loop_takes_one_pass_for_all() -> None:
-    x, passes = X0.to(META), list[int]()
-
-    def body(now: Tensor, given: Tensor) -> tuple[Tensor, Tensor]:
-        passes.append(1)
-        return now + given, now[:, :1]
-
-    assert lanes.repeat(10**9, lambda now: body(now, now)[0], x).shape == x.shape
-    end, outputs = lanes.scan(body, x, x.unsqueeze(1).expand(2, 1000, 2))
-    assert (end.shape, outputs.shape, len(passes)) == (x.shape, (2, 1000, 1), 2)
-
-
-def test_a_basis_built_on_the_meta_device_has_shapes_before_it_has_values() -> None:
-    following = st.StateFollowingCenters(st.rings(6).to(META), 0.1)
-    basis, x = st.StaFBasis(st.GaussianKernel(), following), X0.to(META)
-    assert basis.ideal_weights(x, targets.Paper()).shape == (2, 6)
-    with pytest.raises(ValueError, match="must be given its values first"):
-        basis.ideal_weights(X0, targets.Paper())
-
-
 def decided(name: str) -> Any:
     x, plant, cost = X0.to(META), systems.Pendulum(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
     there_, cost_there = copy.deepcopy(plant).to(META), copy.deepcopy(cost).to(META)
@@ -386,12 +301,3 @@ def decided(name: str) -> Any:
 def test_what_numbers_decide_is_refused_on_the_meta_device(name: str) -> None:
     with pytest.raises(ValueError, match=rf"`{name}.*must have numbers, which decide .* meta"):
         decided(name)
-
-
-def test_an_error_of_a_users_plant_is_his_own() -> None:
-    class Plant(systems.Pendulum):
-        def drift(self, x: Tensor) -> Tensor:
-            raise RuntimeError("Metabolism needs numbers")
-
-    with pytest.raises(RuntimeError, match=r"^Metabolism needs numbers$"):
-        systems.simulate(Plant(), X0, dt=0.01, steps=3)

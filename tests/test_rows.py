@@ -141,7 +141,7 @@ def test_a_row_that_is_not_a_number_spoils_no_other_and_a_batch_of_another_size_
 
 
 def test_a_row_without_an_optimum_spoils_no_other_and_says_why() -> None:
-    shooting, x0 = adp.DirectShooting(PLANT, COST, horizon=0.3, intervals=3), 0.1 * X
+    shooting, x0 = adp.DirectShooting(PLANT, COST, horizon=0.3, intervals=4), 0.1 * X
     spoilt = shooting.solve(torch.cat((X[:1] * torch.nan, x0[1:])))
     assert spoilt.reason[0].startswith("the cost is not finite")
     assert torch.equal(spoilt.value[1:], shooting.solve(x0).value[1:])

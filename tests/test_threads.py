@@ -7,20 +7,18 @@ import multiprocessing
 import pickle
 import signal
 import threading
-from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
-from helpers_threads import COST, OBJECTS, PLANT, X, Y, crowd, together
+from helpers_threads import OBJECTS, X, Y, crowd, together
 from variants import over
 
 import staf_torch as st
-from staf_torch import adp, lanes
-from staf_torch.online import MixtureRegressor, RiverRegressor
+from staf_torch import lanes
+from staf_torch.online import MixtureRegressor
 
 LEARNERS = {
     "filter": lambda: st.StaFRegressor(radius=0.3),
-    "filter with units": lambda: st.StaFRegressor(scaling=True),
     "mixture": lambda: MixtureRegressor(128, 8),
 }
 
@@ -28,18 +26,6 @@ LEARNERS = {
 @over(OBJECTS, "name")
 def test_four_threads_get_the_bits_of_one_and_ask_beside_others_that_learn(name: str) -> None:
     crowd(OBJECTS[name], 24 if OBJECTS[name].learn else 8)
-
-
-@over(LEARNERS, "kind")
-def test_no_sample_of_several_threads_is_lost(kind: str) -> None:
-    model = LEARNERS[kind]()
-
-    def learn(number: int) -> None:
-        for k in range(50):
-            model.partial_fit(X[(4 * k + number) % 40], Y[(4 * k + number) % 40])
-
-    together(4, learn)
-    assert int(model.n_samples_seen_ + model.n_skipped_) == 200
 
 
 @over(LEARNERS, "kind")
@@ -101,24 +87,6 @@ def test_one_of_several_threads_compiles_and_all_are_right() -> None:
     together(4, lambda number: found.update({number: program(*inputs)[1]}))
     assert all(torch.equal(found[0], each) for each in found.values())
     torch.testing.assert_close(found[0], wanted)
-    policy = adp.Feedback(adp.LQR(PLANT, COST)).policy
-    with lanes.compiling("always"), ThreadPoolExecutor(4) as pool:
-        told = [*pool.map(policy, [X[k % 4] for k in range(40)])]
-    assert all(torch.equal(u, told[k % 4]) for k, u in enumerate(told))
-
-
-def test_modes_of_torch_are_each_threads_own() -> None:
-    policy, told = adp.RolloutPolicy.of_lqr(PLANT, COST), {}
-    lanes.ready(policy, X[0])
-    modes = [torch.no_grad, torch.inference_mode, torch.enable_grad, lambda: torch.device("cpu")]
-
-    def ask(number: int) -> None:
-        with modes[number]():
-            for _ in range(5):
-                told[number] = policy(X[3])
-
-    together(4, ask)
-    assert all(torch.equal(told[0], each) for each in told.values())
 
 
 @pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork")
@@ -148,16 +116,3 @@ def test_copies_and_forks_beside_a_thread_that_learns_are_whole_and_free() -> No
     finally:
         done.set()
         thread.join()
-
-
-def test_names_of_rivers_features_are_those_of_one_first_sample() -> None:
-    model = RiverRegressor(st.StaFRegressor(radius=0.3))
-
-    def learn(number: int) -> None:
-        for k in range(25):
-            a, b = X[k].tolist()
-            model.learn_one({"a": a, "b": b} if number % 2 else {"b": b, "a": a}, float(Y[k]))
-            assert model.predict_one({"a": a, "b": b}, with_dist=True).sigma > 0
-
-    together(4, learn)
-    assert int(model.model.n_samples_seen_) == 100

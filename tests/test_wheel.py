@@ -50,9 +50,9 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_wheel_holds_the_package_its_settings_and_nothing_else(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
-    packages = {"staf_torch", "hydra_plugins"}  # Hydra 1.3 looks into the second
-    assert {name.partition("/")[0] for name in names} == packages | {f"staf_torch-{__version__}.dist-info"}
-    assert {name for name in names if name.startswith("hydra_plugins")} == {"hydra_plugins/staf_batched.py"}
+    assert {name.partition("/")[0] for name in names} == {
+        *("staf_torch", "hydra_plugins", f"staf_torch-{__version__}.dist-info")
+    }
     files = [p.relative_to(ROOT / "staf_torch") for p in (ROOT / "staf_torch").rglob("*.py")]
     sources = {f"staf_torch/{p}" for p in files if p.parts[0] != "plugins"}
     assert not any(name.startswith("staf_torch/plugins") for name in names)  # one copy of each file
@@ -71,9 +71,7 @@ def test_an_index_can_show_the_description_and_the_version_is_one(wheel: Path) -
     assert "StaFBasis" in description
     assert "](" not in description  # pictures and links of the README lead nowhere there
     exec(description.split("```python")[1].split("```")[0])
-    (version,) = (line.split()[1] for line in about.splitlines() if line.startswith("Version:"))
-    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
-    assert f"version = {{{version}}}" in (ROOT / "README.md").read_text()
+    assert f"\nVersion: {__version__}\n" in about
 
 
 @pytest.fixture(scope="module")
@@ -101,8 +99,6 @@ def test_wheel_runs_in_a_clean_environment_from_any_directory(
     assert Path(said.splitlines()[0]).resolve().is_relative_to(home.resolve())
     assert "Gradient chase" in said
     (run,) = (tmp_path / "runs").iterdir()
-    files = {".hydra", "run.json", "staf.log", "metrics.json", "history.npz"}
-    assert {path.name for path in run.iterdir()} == files
     assert json.loads((run / "metrics.json").read_text())["diverged_fraction"] == 0
     assert said.count("loss=") == 2
     assert "not available" not in said

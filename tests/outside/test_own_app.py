@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.resources
 import importlib.util
 import io
 import itertools
@@ -27,11 +26,6 @@ from staf_torch import Kernel, StateFollowingCenters, optim, systems
 from staf_torch.settings.chase import centers_of
 
 APP = ROOT / "tests" / "examples" / "own_app.py"
-
-
-def test_the_settings_are_a_package() -> None:
-    names = {entry.name for entry in importlib.resources.files("staf_torch.conf").iterdir()}
-    assert {"__init__.py", "config.yaml", "kernel", "centers"} <= names
 
 
 @pytest.fixture(scope="module")
