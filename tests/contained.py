@@ -13,7 +13,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from types import FrameType
 
@@ -25,30 +24,15 @@ class ToldToEndError(Exception):
     """A signal asked this process to end."""
 
 
-def below(pid: int) -> list[int]:
-    """Return the processes below one that still run."""
-    found = []
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        with contextlib.suppress(OSError):
-            state, parent = stat.read_text().rpartition(")")[2].split()[:2]
-            if int(parent) == pid:
-                child = int(stat.parent.name)
-                found += [child] * (state not in "ZX") + below(child)
-    return found
-
-
 def end_all() -> int:
-    """Kill every process below this one, until there is none; return how many there were."""
-    killed: set[int] = set()
-    while left := below(os.getpid()):
+    """Kill every child until there is none, as the children of those become ours; return how many."""
+    ours, killed = Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children"), set[int]()
+    while left := [int(pid) for pid in ours.read_text().split()]:
         killed.update(left)
         for pid in left:
-            with contextlib.suppress(ProcessLookupError):
+            with contextlib.suppress(ProcessLookupError, ChildProcessError):
                 os.kill(pid, signal.SIGKILL)
-        with contextlib.suppress(ChildProcessError):
-            while os.waitpid(-1, os.WNOHANG)[0]:
-                pass
-        time.sleep(0.05)
+                os.waitpid(pid, 0)
     return len(killed)
 
 

@@ -32,19 +32,20 @@ Numbers = dict[str, "list[float] | str"]
 
 def numbers(value: Any) -> Numbers:
     """What is recorded of a value: numbers of every tensor, array, number and text in it, by its path."""
-    return dict(_parts(value, "", _DEEP))
+    parts = leaves(value)
+    return {
+        path: part if isinstance(part, str) else _sums(torch.as_tensor(part).detach()) for path, part in parts
+    }
 
 
-def _parts(value: Any, path: str, deep: int) -> Iterator[tuple[str, list[float] | str]]:
-    if isinstance(value, str):
+def leaves(value: Any, path: str = "", deep: int = _DEEP) -> Iterator[tuple[str, Any]]:
+    """Paths and values of all tensors, arrays, numbers and texts in an object."""
+    if isinstance(value, str | Tensor | np.ndarray | int | float):
         yield path, value
-    elif isinstance(value, Tensor | np.ndarray | int | float):
-        yield path, _sums(torch.as_tensor(value).detach())
     else:
         for name, part in _inside(value) if deep else ():
-            if name in _MEASURED:
-                continue
-            yield from _parts(part, f"{path}.{name}".strip("."), deep - 1)
+            if name not in _MEASURED:
+                yield from leaves(part, f"{path}.{name}".strip("."), deep - 1)
 
 
 def _inside(value: Any) -> Iterator[tuple[str, Any]]:

@@ -86,9 +86,7 @@ def inside(calls: int, seed: int, chosen: Sequence[str]) -> None:
     from helpers_threads import OBJECTS, crowd
 
     from staf_torch import lanes
-    from staf_torch.online import StaFRegressor
-    from staf_torch.online.mixture.regressor import Bank
-    from staf_torch.online.mixture.rules import RECENT, BankShape
+    from staf_torch.online import MixtureRegressor, StaFRegressor
 
     chance = random.Random(seed)
     torch.manual_seed(seed)
@@ -132,38 +130,29 @@ def inside(calls: int, seed: int, chosen: Sequence[str]) -> None:
         for one, other in zip((*found[0], *found[1]), (*expected[0], *expected[1]), strict=True):
             torch.testing.assert_close(one, other, rtol=close, atol=close)
 
-    def a_filter() -> None:
-        times, streams = chance.choice((1, 2, 3, 5, 17)), chance.choice((0, 1, 1, 2, 3, 9))
+    def a_filter(kind: type = StaFRegressor) -> None:
+        times, streams = chance.choice((1, 2, 3, 5, 17, 70)), chance.choice((0, 1, 1, 2, 3, 9))
         shape = (times, streams, 2) if streams else (times, 2)
         wrong = chance.random() < 0.2
         x = laid_out(shape, chance.choice([torch.float64, torch.float32]))
         y = laid_out((*shape[:-1][: 1 if wrong else None],), x.dtype)
         try:
-            model = StaFRegressor().fit(x, y)
+            model = kind().fit(x, y)
             predicted = model.predict(x[-1])
         except (ValueError, RuntimeError, TypeError):
             return
         assert torch.as_tensor(predicted).shape[: len(shape) - 2] == shape[1:-1]
 
-    def a_bank() -> None:
-        """Some samples for some streams, of which some go on."""
-        streams, steps = chance.choice((0, 1, 1, 2, 3)), chance.choice((0, 1, 2, 12, 70))
-        shape = BankShape(dim=2, outputs=1, capacity=RECENT, neighbours=3)
-        bank = Bank(shape, streams, chance.random() < 0.5)
-        for at in range(steps):
-            x = torch.rand(bank.count, 2, dtype=torch.float64) * chance.choice([1e-300, 1.0, 1e150])
-            y = torch.rand(bank.count, 1, dtype=torch.float64) * chance.choice([1.0, 1.0, float("inf")])
-            bank.learn(x, y, chance.choice([None, torch.rand(bank.count, dtype=torch.float64)]))
-            bank.predict(x)
-            if at == 5:
-                bank.keep(torch.arange(bank.count)[1:])
-                bank.add(2)
-
     def some_threads() -> None:
         with lanes.compiling("always"):
             crowd(OBJECTS[chance.choice([*OBJECTS])], chance.choice([1, 8, 60]))
 
-    kinds = {"programs": a_program, "filters": a_filter, "banks": a_bank, "threads": some_threads}
+    kinds = {
+        "programs": a_program,
+        "filters": a_filter,
+        "banks": lambda: a_filter(MixtureRegressor),
+        "threads": some_threads,
+    }
     often = {"programs": 30, "filters": 10, "banks": 5, "threads": 1}
     counts = dict.fromkeys(chosen, 0)
     for at in range(calls):

@@ -21,35 +21,19 @@ _TEXT = ("read_text", "write_text")
 _PATCHES = {"setattr", "delattr", "setitem", "delitem", "patch", "object", "multiple", "dict"}
 
 
-def without_dtype(nodes: Sequence[ast.AST]) -> Iterator[str]:
-    """Calls that make a tensor of torch's default dtype, which is the user's: by line."""
-    cast = {
-        id(node.func.value)
-        for node in nodes
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in _CASTS
-    }
-    for node in nodes:
-        if (
-            isinstance(node, ast.Call)
-            and isinstance(node.func, ast.Attribute)
-            and node.func.attr in _MAKERS
-            and id(node) not in cast
-            and ast.unparse(node.func.value) == "torch"
-            and not any(word.arg in ("dtype", "out", None) for word in node.keywords)
-        ):
-            yield f"{node.lineno}: {ast.unparse(node)[:80]}"
-
-
-def without_device(nodes: Sequence[ast.AST]) -> Iterator[str]:
-    """Calls that make a tensor, or a layer's parameters, on torch's default device, which is the user's: by
-    line. So may whoever gets such a function under another name."""
+def on_defaults(nodes: Sequence[ast.AST]) -> Iterator[str]:
+    """Calls that make a tensor, or a layer's parameters, of torch's default device or dtype, which are the
+    user's: by line. So may whoever gets such a function under another name."""
     calls = {id(node.func): node for node in nodes if isinstance(node, ast.Call)}
+    cast = {id(node.value) for node in nodes if isinstance(node, ast.Attribute) and node.attr in _CASTS}
     for node in nodes:
         if isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == "torch":
             yield from (f"{node.lineno}: imports {each.name}" for each in node.names if _makes(each.name))
         elif isinstance(node, ast.Attribute) and _makes(node.attr) and _plain_root(node) in ("torch", "nn"):
             call = calls.get(id(node))
-            if call is None or not any(word.arg in ("device", "out") for word in call.keywords):
+            words = {word.arg for word in call.keywords} if call else set()
+            typed = node.attr not in _MAKERS or id(call) in cast or words & {"dtype", "out", None}
+            if not words & {"device", "out"} or not typed:
                 yield f"{node.lineno}: {ast.unparse(node if call is None else call)[:80]}"
 
 

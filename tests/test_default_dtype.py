@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -12,8 +11,9 @@ import torch
 from composing import settings
 from helpers import basis_of
 from helpers_chase import BASES, LAW, circles
+from recorded import leaves
 from test_modules import MODULES, X
-from torch import Tensor, nn
+from torch import Tensor
 from variants import DESCENDING, KERNELS, LAYOUTS, PLANTS, PREDICTORS, TARGETS, over
 
 import staf_torch as st
@@ -33,23 +33,9 @@ def default(dtype: torch.dtype) -> Iterator[None]:
         torch.set_default_dtype(before)
 
 
-def numbers(thing: Any) -> Iterator[Tensor]:
+def numbers(thing: Any) -> list[Tensor]:
     """Every number of a result, with its dtype."""
-    if isinstance(thing, Tensor):
-        yield thing.detach()
-    elif isinstance(thing, np.ndarray):
-        yield torch.from_numpy(thing)
-    elif isinstance(thing, bool | int | float):
-        yield torch.tensor(thing, dtype=torch.float64)
-    elif isinstance(thing, nn.Module):
-        yield from (each.detach() for each in (*thing.parameters(), *thing.buffers()))
-    elif dataclasses.is_dataclass(thing):
-        yield from numbers(vars(thing))
-    elif isinstance(thing, Mapping):
-        yield from numbers(list(thing.values()))
-    elif isinstance(thing, list | tuple):
-        for each in thing:
-            yield from numbers(each)
+    return [torch.as_tensor(part).detach() for _, part in leaves(thing) if not isinstance(part, str)]
 
 
 def shooting() -> Any:
@@ -104,7 +90,7 @@ def test_no_number_depends_on_the_default_dtype(name: str) -> None:
     for dtype in (torch.float32, torch.float64):
         torch.manual_seed(0)
         with default(dtype):
-            found.append(list(numbers(THINGS[name]())))
+            found.append(numbers(THINGS[name]()))
     single, double = found
     assert len(single) == len(double) > 0
     for one, two in zip(single, double, strict=True):

@@ -282,9 +282,7 @@ def decided(name: str) -> Any:
     there_, cost_there = copy.deepcopy(plant).to(META), copy.deepcopy(cost).to(META)
     problem = adp.SampledProblem.of(plant, cost, dt=0.05)
     return {
-        "LQR": lambda: adp.LQR(there_, cost_there),
         "near_optimal": lambda: adp.near_optimal(there_, cost_there, dt=0.05),
-        "SampledProblem": lambda: adp.SampledProblem.of(there_, cost_there, dt=0.05),
         "BoxDDP": lambda: adp.BoxDDP(problem, steps=3).solve(x),
         "StaFRegressor.tune": lambda: st.StaFRegressor().tune(x, x[:, 0]),
         "MixtureRegressor": lambda: online.MixtureRegressor().fit(x, x[:, 0]),
@@ -296,7 +294,7 @@ def decided(name: str) -> Any:
 
 @pytest.mark.parametrize(
     "name",
-    ["LQR", "near_optimal", "SampledProblem", "BoxDDP", "StaFRegressor.tune", "MixtureRegressor", "simulate"],
+    ["near_optimal", "BoxDDP", "StaFRegressor.tune", "MixtureRegressor", "simulate"],
 )
 def test_what_numbers_decide_is_refused_on_the_meta_device(name: str) -> None:
     with pytest.raises(ValueError, match=rf"`{name}.*must have numbers, which decide .* meta"):

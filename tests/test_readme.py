@@ -14,7 +14,6 @@ import json
 import re
 import shlex
 import shutil
-import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -102,29 +101,6 @@ def test_examples_stand_side_by_side_within_the_column() -> None:
     widest = [max(map(len, block.splitlines())) for _, _, block in guides.blocks(cells, ("python",))]
     assert len(widest) == 2
     assert 8.2 * sum(widest) + 118 <= 830
-
-
-def test_versions_are_those_of_the_last_run_of_the_matrix() -> None:
-    """Of the front page and of the classifiers: the table of tests/README.md has them."""
-    rows = [line for line in read(ROOT / "tests" / "README.md").splitlines() if " passed, " in line]
-    tried: dict[str, set[str]] = {
-        each: {found for row in rows for found in re.findall(rf"{each} (\d+\.\d+)", row)}
-        for each in ("Python", "torch", "Hydra")
-    }
-    ends = {each: sorted(found, key=lambda v: int(v.partition(".")[2])) for each, found in tried.items()}
-    python, torch, _ = ends.values()
-    assert f"Python {python[0]} to {python[-1]}, torch {torch[0]} or newer" in read(README)
-    about = tomllib.loads(read(ROOT / "pyproject.toml"))["project"]
-    named = [c.rpartition(" ")[2] for c in about["classifiers"] if c.startswith("Programming Language")]
-    assert named == python
-
-
-def test_first_commands_end_with_pytest() -> None:
-    """They are what `.ci/run` executes."""
-    first = re.search(r"^```bash\n(.*?)^```$", read(README), re.DOTALL | re.MULTILINE)
-    assert first is not None
-    assert first[1].splitlines()[-1] == "pytest"
-    assert len(first[1].splitlines()) == 2
 
 
 def test_every_manual_is_reached_from_the_front_page() -> None:

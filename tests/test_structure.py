@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import pytest
 import yaml
 from command_line import ROOT
-from source_rules import looks_inside, without_device, without_dtype, without_encoding
+from source_rules import looks_inside, on_defaults, without_encoding
 
 import staf_torch
 
@@ -69,7 +69,7 @@ def about(name: str) -> About:
     path = MODULES[name]
     tree = nodes(path)
     kinds = (node.name for node in tree if isinstance(node, ast.ClassDef))
-    said = told(path, tree, without_dtype, without_device, without_encoding)
+    said = told(path, tree, on_defaults, without_encoding)
     documented = (ast.get_docstring(each) for each in tree if isinstance(each, DOCUMENTABLE))
     lines = (text.partition("\n")[0] for text in documented if text)
     return About(tuple(kinds), tuple(said), tuple(lines))
@@ -175,6 +175,7 @@ def test_no_number_depends_on_torchs_default_dtype_or_device_and_no_text_on_a_lo
 
 ON_THE_DEFAULT_DEVICE = """
 torch.zeros(3)
+torch.zeros(3, device=x.device)
 torch.as_tensor([1.0], dtype=torch.float64)
 torch.zeros(3, **more)
 map(torch.tensor, numbers)
@@ -185,10 +186,13 @@ nn.Linear(2, 1)
 
 def test_what_makes_tensors_on_the_default_device_is_found_and_what_names_another_is_not() -> None:
     def found(lines: str) -> list[str]:
-        return [*without_device([*ast.walk(ast.parse(lines))])]
+        return [*on_defaults([*ast.walk(ast.parse(lines))])]
 
     assert [line for line in ON_THE_DEFAULT_DEVICE if not found(line)] == []
-    assert found('torch.zeros(3, device=x.device); torch.zeros_like(x); nn.Linear(2, 1, device="cpu")') == []
+    assert (
+        found('torch.zeros(3, device=x.device).double(); torch.zeros_like(x); nn.Linear(2, 1, device="cpu")')
+        == []
+    )
 
 
 def test_docstrings_begin_with_a_subject_and_an_action() -> None:
@@ -206,7 +210,7 @@ def test_no_test_looks_inside_the_package() -> None:
 
 FORBIDDEN = """
 from staf_torch.lanes import _part
-from types import SimpleNamespace
+policy = SimpleNamespace(step=1)
 adp.LQR.__new__(adp.LQR)
 monkeypatch.setattr(adp.rollout, "horizon", 1)
 monkeypatch.setattr("staf_torch.adp.policies.rollout.horizon", 1)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import io
-import itertools
 import logging
 import os
 import re
@@ -20,7 +19,6 @@ from command_line import ROOT, in_a_child
 from composing import HYDRA
 from hydra import compose, initialize
 from hydra.utils import instantiate
-from omegaconf import DictConfig
 
 from staf_torch import Kernel, StateFollowingCenters, optim, systems
 from staf_torch.settings.chase import centers_of
@@ -85,47 +83,22 @@ def test_our_launcher_says_that_it_cannot_batch_another_program(sweeps: list[dic
     assert words not in quiet["out"]
 
 
-OPTIONS = sorted(
-    f"{group}={path.stem}"
-    for group in ("kernel", "centers", "optimizer", "system", "target")
-    for path in (ROOT / "conf" / group).glob("*.yaml")
-    if path.stem != "mujoco"  # a plant of closed loops, with an extra: tests/settings/test_adp_groups.py
-)
-OPEN = {  # options that ask for something, and what an application would give
-    "centers=directions": ["centers.directions=[[0.0,0.0],[0.6,0.8]]"],
-    "kernel=custom": ["kernel.path=staf_torch.GaussianKernel"],
-    "optimizer=custom": ["optimizer.path=staf_torch.optim.HeavyBall"],
-    "system=custom": ["system.path=staf_torch.systems.Pendulum"],
-    "target=custom": ["target.path=staf_torch.targets.Paper"],
-}
-TYPES = {
-    "kernel": Kernel,
-    "centers": StateFollowingCenters,
-    "optimizer": optim.UpdateLaw,
-    "system": systems.ControlAffineSystem,
-    "target": Callable,
+CHOSEN = {
+    "kernel=gaussian": Kernel,
+    "centers=ball": StateFollowingCenters,
+    "optimizer=steepest_descent": optim.UpdateLaw,
+    "system=custom": systems.ControlAffineSystem,
+    "target=paper": Callable,
 }
 
 
-@pytest.fixture(scope="module")
-def nodes() -> dict[str, DictConfig]:
-    """Every option, composed by an application that has nothing but our search path."""
-    search, found = "hydra.searchpath=[pkg://staf_torch.conf]", {}
-    by_group = [[option for option in OPTIONS if option.startswith(f"{group}=")] for group in TYPES]
+def test_an_option_of_each_group_instantiates_in_an_application_that_has_our_search_path() -> None:
+    lines = [*(f"+{option}" for option in CHOSEN), "system.path=staf_torch.systems.Pendulum"]
     with initialize(config_path=None, **HYDRA):
-        for together in itertools.zip_longest(*by_group):  # one of each group: a few compositions do for all
-            chosen = [option for option in together if option is not None]
-            more = [line for option in chosen for line in OPEN.get(option, [])]
-            cfg = compose(overrides=[search, *(f"+{option}" for option in chosen), *more])
-            found |= {option: cfg[option.partition("=")[0]] for option in chosen}
-    return found
-
-
-@pytest.mark.parametrize("option", OPTIONS)
-def test_an_option_of_a_group_instantiates_on_its_own(option: str, nodes: dict[str, DictConfig]) -> None:
-    group, node = option.partition("=")[0], nodes[option]
-    more = {"dim": 3} if option in ("centers=ball", "centers=simplex", "centers=cross_polytope") else {}
-    assert isinstance(instantiate(node, **more), TYPES[group])
+        cfg = compose(overrides=["hydra.searchpath=[pkg://staf_torch.conf]", *lines])
+    for option, kind in CHOSEN.items():
+        more = {"dim": 3} if option == "centers=ball" else {}
+        assert isinstance(instantiate(cfg[option.partition("=")[0]], **more), kind), option
 
 
 def test_a_layout_without_a_dimension_asks_for_it() -> None:
