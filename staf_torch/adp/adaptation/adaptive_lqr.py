@@ -77,7 +77,7 @@ class AdaptiveLQR(Controller):
         >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
         >>> law = adp.LeastSquares([0.6], deviation=0.5)  # the actuator is healthy: theta = 1
         >>> control = adp.AdaptiveLQR(plant, cost, adp.IntegralWindows(plant, 0.05), law)
-        >>> run = adp.simulate(control, plant, cost, torch.tensor([[0.5, 0.0]]).double(), dt=0.02, steps=75)
+        >>> run = adp.simulate(control, plant, cost, torch.tensor([[0.5, 0.0]]).double(), dt=0.02, steps=15)
         >>> run["theta"][0, -1].round(decimals=2)
         tensor([1.], dtype=torch.float64)
 

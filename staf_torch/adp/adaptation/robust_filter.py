@@ -59,7 +59,7 @@ class RobustFilter(Controller):
         >>> box = {"theta_low": [0.4], "theta_high": [1.0]}
         >>> safe = adp.RobustFilter(wanted, plant, wall, windows, law, dt=0.02, **box)
         >>> cost, x0 = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1), torch.tensor([[1.0, -2.0]]).double()
-        >>> run = adp.simulate(safe, plant, cost, x0, steps=40)
+        >>> run = adp.simulate(safe, plant, cost, x0, steps=15)
         >>> bool(run["least_margin"][0, -1] > 0), run["theta"][0, -1].round(decimals=2)
         (True, tensor([1.], dtype=torch.float64))
 

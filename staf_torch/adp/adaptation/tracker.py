@@ -48,10 +48,10 @@ class ConcurrentTracker(Controller):
         >>> plant = adp.ParametricPlant(regressor, lambda z, u: u, dim=1, inputs=1, theta=[2.0])
         >>> def rest(z):
         ...     return torch.ones_like(z), torch.zeros_like(z)  # xd = 1
-        >>> tracker = adp.ConcurrentTracker(plant, rest, length=0.05, feedback=2.0, gain=2000.0, size=5)
+        >>> tracker = adp.ConcurrentTracker(plant, rest, length=0.05, feedback=4.0, gain=2000.0, size=5)
         >>> cost = adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1)
         >>> x0 = torch.tensor([[-1.0]]).double()
-        >>> run = adp.simulate(tracker, plant, cost, x0, dt=0.01, steps=400)
+        >>> run = adp.simulate(tracker, plant, cost, x0, dt=0.01, steps=200)
         >>> run.state[0, -1].round(decimals=2)
         tensor([1.], dtype=torch.float64)
         >>> run["theta"][0, -1].round(decimals=2)

@@ -251,12 +251,12 @@ class DetourPlans(Controller):
         >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, low=-1.0, high=1.0)
         >>> lqr = adp.LQR(plant, cost, period=0.1)
         >>> wall = [lambda x, t: x[:, 0] + 0.1]
-        >>> there = {"axes": [[1.0, 0.0]], "steps": 12, "terminal": lqr.value, "sizes": [0.5], "lengths": [6]}
+        >>> there = {"axes": [[1.0, 0.0]], "steps": 6, "terminal": lqr.value, "sizes": [0.5], "lengths": [3]}
         >>> ahead = adp.DetourRollout(lqr, plant, cost, wall, dt=0.1, **there)
         >>> plans, x0 = adp.DetourPlans(ahead), torch.tensor([[1.0, 0.0]]).double()
-        >>> run = adp.simulate(plans, plant, cost, x0, steps=2)
+        >>> run = adp.simulate(plans, plant, cost, x0, steps=1)
         >>> run.control.shape
-        torch.Size([1, 3, 1])
+        torch.Size([1, 2, 1])
 
         Shown by `staf_torch/adp/README.md`.
 
