@@ -35,7 +35,9 @@ def default(dtype: torch.dtype) -> Iterator[None]:
 
 def numbers(thing: Any) -> list[Tensor]:
     """Every number of a result, with its dtype."""
-    return [torch.as_tensor(part).detach() for _, part in leaves(thing) if not isinstance(part, str)]
+    parts = (part for _, part in leaves(thing) if not isinstance(part, str))
+    kinds = ((part, torch.float64 if isinstance(part, float) else None) for part in parts)
+    return [torch.as_tensor(part, dtype=dtype).detach() for part, dtype in kinds]
 
 
 def shooting() -> Any:
