@@ -215,22 +215,22 @@ IN_NUMPY = systems.StepPlant(lambda x, u: 0.9 * x + np.asarray(u), dim=2, inputs
 @pytest.mark.needs_compiler
 @pytest.mark.compiled
 @pytest.mark.parametrize(
-    ("work", "costly", "compile", "plant", "compiled"),
+    ("costly", "compile", "plant", "compiled"),
     [
-        (1.0, False, "auto", PLANT, False),
-        (1e4, False, "auto", PLANT, True),
-        (1e4, True, "auto", PLANT, False),
-        (1e4, False, False, PLANT, False),
-        (1e4, False, "auto", IN_NUMPY, False),
-        (1.0, True, True, PLANT, True),
+        (False, "auto", PLANT, True),
+        (True, "auto", PLANT, False),
+        (True, True, PLANT, True),
+        (False, "auto", IN_NUMPY, False),
     ],
 )
 def test_a_loop_is_compiled_where_its_work_pays(
-    work: float, costly: bool, compile: Any, plant: systems.Plant, compiled: bool
+    costly: bool, compile: Any, plant: systems.Plant, compiled: bool
 ) -> None:
     calls = []
 
     class Busy(adp.Controller):
+        work = 1e4
+
         def init(self, x0: Tensor) -> Tensor:
             return torch.zeros_like(x0[:, 0])
 
@@ -238,19 +238,15 @@ def test_a_loop_is_compiled_where_its_work_pays(
             calls.append(len(x))
             return -x[:, 1:], carried
 
-    Busy.work, Busy.costly = work, costly
+    Busy.costly = costly
     run(Busy(), plant, x0=X0[:2], steps=40, compile=compile)
     assert (len(calls) < 30) is compiled  # else plain torch asks at every step
 
 
-class Pushed(systems.TwoState):
-    def drift(self, x: Tensor) -> Tensor:
-        return super().drift(x) + 1.0
-
-
-def test_a_plant_that_nothing_holds_at_the_set_point_runs_and_the_log_says_so(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    with caplog.at_level("WARNING"):
-        run(plant=Pushed(), steps=1)
-    assert "nothing holds the plant at the set-point: `Pushed.drift` must be 0 at the origin" in caplog.text
+def test_arguments_of_a_run_are_refused_by_name() -> None:
+    with pytest.raises(
+        ValueError, match=r"`simulate\(controller=...\)` must be a Controller or a function of x"
+    ):
+        run(3)
+    with pytest.raises(ValueError, match=r"`simulate\(every=...\)` must divide the 6 steps; got 4"):
+        run(every=4)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from helpers import tensor, uniform
@@ -90,17 +89,6 @@ def test_what_is_carried_keeps_its_form(initial: Any, after: Any, message: str) 
     x0 = torch.ones(3, 2, dtype=torch.float64)
     with pytest.raises(ValueError, match=message):
         adp.simulate(Misfit(initial, after), TWO_STATE, COST, x0, dt=0.1, steps=2)
-
-
-def test_a_feedback_has_the_name_the_period_and_the_value_of_its_policy() -> None:
-    lqr, x = adp.LQR(TWO_STATE, COST, period=0.2), uniform(3, 2, seed=1)
-    plain, valued = adp.Feedback(np.negative), adp.Feedback(lqr, lqr.value)
-    assert (plain.label, plain.period, valued.label, valued.period) == ("negative", None, "LQR", 0.2)
-    assert plain.value(x, {}) is None
-    guarded = adp.Supervised(valued, lqr, COST)
-    assert guarded.period == 0.2
-    for each in (valued, guarded):
-        torch.testing.assert_close(each.value(x, {}), lqr.value(x))
 
 
 class Integral(nn.Module):

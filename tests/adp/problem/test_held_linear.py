@@ -10,7 +10,7 @@ from helpers import tensor, uniform
 from torch import Tensor
 
 from staf_torch import adp, systems
-from staf_torch.adp.problem.held_linear import exact_hold, held_riccati, linear_hold, periods
+from staf_torch.adp.problem.held_linear import exact_hold, held_riccati, linear_hold
 
 INF = math.inf
 SCALAR = systems.Linear([[0.0]], [[1.0]])
@@ -121,15 +121,6 @@ def test_a_mode_that_grows_slower_than_the_discount_need_not_be_stabilised(steps
     assert bool(torch.isfinite(p).all())
     with pytest.raises(ValueError, match="not stabilisable"):
         held_riccati(plant, adp.QuadraticCost(1.0, 1.0, 2, 1, discount=0.3), 0.1)
-
-
-def test_a_period_is_a_multiple_to_a_billionth() -> None:
-    plant = in_steps(tensor([[1.0]]), tensor([[1.0]]), 0.5)
-    for dt in (1.5 * (1 + 0.9e-9), 1.5 * (1 - 0.9e-9)):
-        assert periods("call", plant, dt) == 3
-    for dt in (1.5 * (1 + 1.2e-9), 1.5 * (1 - 1.2e-9), 0.2):
-        with pytest.raises(ValueError, match=r"dt=...\)` must be a multiple of the plant's period of 0.5 s"):
-            periods("call", plant, dt)
 
 
 def test_stability_of_the_held_integrator_is_known() -> None:

@@ -64,19 +64,6 @@ def test_rows_with_lengths_of_their_own_go_where_fine_steps_lead_and_pay_that(
         assert not torch.equal(x[1], plain[1])  # its own steps are shorter
 
 
-@pytest.mark.parametrize("substeps", [4, (2, 8)])
-def test_one_state_that_decays_is_held_as_its_exponential(substeps: Any) -> None:
-    decay, t = 0.5, 0.4
-    plant, cost = systems.Linear([[-decay]], [[1.0]]), adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1)
-    start, u = tensor([[0.8], [-0.3], [0.05]]), tensor([[0.4], [0.0], [-1.0]])
-    center, apart, left = u / decay, start - u / decay, math.exp(-decay * t)
-    square = center**2 * t + 2 * center * apart * (1 - left) / decay + apart**2 * (1 - left**2) / (2 * decay)
-    for renewed in (None, lambda x: u):  # asked again, the same control costs the same
-        x, spent = Holding("Test", plant, cost, t, substeps)(start, u, renewed)
-        torch.testing.assert_close(x, center + left * apart, rtol=1e-6, atol=1e-8)
-        torch.testing.assert_close(spent, (square + u**2 * t).squeeze(-1), rtol=1e-4, atol=1e-6)
-
-
 @pytest.mark.parametrize(("clocked", "discount"), [(False, 0.0), (True, 0.9)])
 def test_plants_in_steps_pay_at_the_start_of_each(discount: float, clocked: bool) -> None:
     inner = systems.StepPlant(lambda x, u: 0.9 * x.sin() + u, dim=2, inputs=1, dt=0.1)
