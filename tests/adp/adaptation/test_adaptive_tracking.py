@@ -158,17 +158,6 @@ def test_receding_horizon_plans_along_the_path_from_the_time_that_it_is() -> Non
     assert float((PROBLEM.linear_feedback(x) - controls[:, 2]).abs().min()) > 0.01
 
 
-def test_closed_loop_in_continuous_time_counts_the_distance_from_the_path() -> None:
-    plant = systems.Clocked(systems.Linear([[0.0]], [[1.0]]))
-    cost = adp.TrackingCost(2.0, 1.0, dim=1, inputs=1, path=lambda t: t.unsqueeze(-1), low=-1.0, high=1.0)
-    run = adp.simulate(
-        adp.Feedback(lambda x: torch.ones_like(x[..., :1])), plant, cost, plant.at(NONE.new_zeros(1, 1)),
-        dt=0.1, steps=20,
-    )  # fmt: skip
-    torch.testing.assert_close(run.state[0, -1], torch.tensor([2.0, 2.0]).double())
-    torch.testing.assert_close(run.cost, torch.tensor([2.0]).double())  # of the control alone
-
-
 def test_what_cannot_follow_a_path_says_so() -> None:
     with pytest.raises(ValueError, match=r"`TrackingCost\(plant=...\)` must have a clock"):
         adp.LQR(mass(), COST)

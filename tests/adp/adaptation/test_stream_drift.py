@@ -74,15 +74,6 @@ def test_moved_centers_keep_what_was_known_and_own_up_to_what_they_lost() -> Non
     assert float(spread) == pytest.approx(3.0 * float((x + 20.0).norm()))  # the prior's
 
 
-def test_a_known_drift_counts_by_its_slope_along_the_way() -> None:
-    plant = systems.TwoState()
-    drift = adp.StreamDrift(plant, GaussianKernel(2.0), CENTERS, rows=[0, 1], deviation=1.0, length=0.05)
-    x = uniform(50, 2, seed=1)
-    a, covariance = drift.matrix(drift.init(x), x)
-    torch.testing.assert_close((a * x.unsqueeze(-2)).sum(-1), plant.drift(x), rtol=1e-4, atol=1e-4)
-    torch.testing.assert_close(covariance, torch.eye(2).double().expand(50, 2, 2))
-
-
 @pytest.fixture(scope="module")
 def learned() -> tuple[adp.DriftLQR, adp.LoopResult, Tensor]:
     plant = systems.TwoState()

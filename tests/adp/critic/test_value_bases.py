@@ -120,8 +120,3 @@ def test_points_are_the_cube_scaled_around_the_state_or_the_origin(around: str) 
         shrinking = st.StateRadius(0.5, 0.1)
         found = adp.RandomPoints(4, shrinking)(x, drawn)
         torch.testing.assert_close(found, x.unsqueeze(1) + shrinking(x)[:, None, None] * drawn)
-    else:
-        with pytest.raises(
-            ValueError, match=r"\(half_width=...\)` must be constant for a box around the origin"
-        ):
-            adp.RandomPoints(4, st.StateRadius(0.5, 0.1), around="origin")

@@ -137,13 +137,10 @@ def test_a_plant_that_rests_nowhere_is_refused_by_what_regulates_alone() -> None
         adp.near_optimal(plant, COST)
 
 
-def test_kinks_and_lost_modes_are_named() -> None:
+def test_kinks_are_named() -> None:
     kinked = pendulum(lambda x, u: x + 0.1 * np.abs(x[:, ::-1] + u - 1e-4) - 1e-5)
     with pytest.raises(ValueError, match=r"`StepPlant\(step=...\)` is not smooth at the state"):
         adp.LQR(kinked, COST)
-    lost = pendulum(lambda x, u: np.stack((1.5 * x[:, 0], 0.5 * x[:, 1] + u[:, 0]), axis=1))
-    with pytest.raises(ValueError, match=r"StepPlant .* not stabilisable.* eigenvalue 1.5 a step"):
-        adp.LQR(lost, COST)
 
 
 @pytest.mark.parametrize(("seconds", "said"), [(0.04, False), (0.06, True)])
