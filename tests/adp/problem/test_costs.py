@@ -297,6 +297,7 @@ def test_matrices_are_numbers_diagonals_or_matrices_in_double_precision() -> Non
         ({"terminal": 1.0, "output": lambda x: x}, r"must be None beside an output or a discount"),
         ({"terminal": -Q}, r"`QuadraticCost\(terminal=...\)` must be positive semidefinite"),
         ({"low": 1.0, "high": 1.0}, "must be below high"),
+        ({"control": torch.eye(5) + 0.1, "inputs": 5, "low": -1.0}, "more than 4 bounded inputs"),
         ({"low": [0.0, 1.0, 2.0]}, r"`Bounds\(low=...\)` must be a number or one for each"),
     ],
 )

@@ -150,6 +150,11 @@ def clocked(tick: float) -> Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]:
     return step
 
 
+def test_angles_are_among_the_states() -> None:
+    with pytest.raises(ValueError, match=r"periodic=...\)` must be coordinates of 3; got \[-4\]"):
+        adp.SampledProblem(swung, dim=3, inputs=2, periodic=[-4])
+
+
 def test_a_path_needs_a_time_that_moves() -> None:
     def path(t: Tensor) -> Tensor:
         return 0 * t.unsqueeze(-1)
