@@ -1,7 +1,7 @@
 """The chase by its equations alone: row by row, time by time, in the paper's weights, K formed and solved.
 
-Every way of the library must find the same: the definition in one piece and in pieces, and the step of a row,
-which is what is compiled, in plain torch.
+Every way of the library must find the same: the definition in one piece and in pieces, and what is compiled
+(`test_compiled.py`).
 """
 
 from __future__ import annotations
@@ -20,12 +20,7 @@ from torch import Tensor
 import staf_torch as st
 from staf_torch import chase, chase_weights, optim, predictors
 from staf_torch.engine import ChaseResult, chase_pieces
-from staf_torch.engine.problem import Problem
-from staf_torch.engine.quantities import with_certificate
-from staf_torch.engine.recursion import start
 from staf_torch.engine.result import concatenate
-from staf_torch.engine.row_program import Step, first_carry
-from staf_torch.lanes import Program
 from staf_torch.targets import Paper
 
 ITERATIONS, FIRST = 2, tensor([[0.3, -0.2, 0.5], [0.0, 0.1, -0.4]])
@@ -141,42 +136,6 @@ def in_pieces(states: Tensor, *given: Any, **options: Any) -> ChaseResult:
     return concatenate(list(chase_pieces(states.split([1, 2, 1, TIMES - 4], 1), *given, **options)))
 
 
-def by_steps(
-    states: Tensor,
-    basis: st.StaFBasis,
-    target: Callable[[Tensor], Tensor],
-    law: optim.UpdateLaw,
-    *,
-    inner_steps: int = 10,
-    predictor: Any = None,
-    weights: Tensor | None = None,
-    certificate: bool = False,
-) -> ChaseResult:
-    """The step of a row, time after time in plain torch; its weights alone are the same."""
-    problem = Problem("chase", basis, target, law, inner_steps, predictor, certificate)
-    carry = first_carry(problem, start(problem, states, weights))
-    after, out = Program(Step(problem, True), compile=False)(carry, states)
-    few = Program(Step(problem, False), compile=False)(carry, states)[1].weights
-    result = out.numbers.result(states, after.chase.diverged_at)
-    torch.testing.assert_close(few, result.weights, rtol=1e-9, atol=1e-11)
-    if not certificate:
-        return result
-    return with_certificate(result, out.certificate, torch.zeros_like(result.value, dtype=torch.bool))
-
-
-WAYS: dict[str, Callable[..., ChaseResult]] = {
-    "definition": chase,
-    "in pieces": in_pieces,
-    "by steps": by_steps,
-}
-
-
-@pytest.fixture(params=WAYS)
-def run(request: pytest.FixtureRequest) -> Callable[..., ChaseResult]:
-    """A chase in one of three ways."""
-    return WAYS[request.param]
-
-
 PAIRS = [
     *(("exponential", name) for name in ("none", "guarded", "second order")),
     ("gaussian", "secant"),
@@ -185,11 +144,10 @@ PAIRS = [
 ]
 
 
-@pytest.mark.parametrize("way", ["definition", "by steps"])
 @pytest.mark.parametrize(("name", "predictor"), PAIRS)
-def test_a_chase_is_what_its_equations_say(name: str, predictor: str, way: str) -> None:
+def test_a_chase_is_what_its_equations_say(name: str, predictor: str) -> None:
     basis = BASES[name]
-    result = WAYS[way](
+    result = chase(
         STATES,
         basis,
         Paper(),
@@ -217,6 +175,7 @@ def test_a_chase_is_what_its_equations_say(name: str, predictor: str, way: str) 
     torch.testing.assert_close(result.coefficients, scale * gains * result.weights, rtol=1e-12, atol=1e-13)
 
 
+@pytest.mark.parametrize("run", [chase, in_pieces])
 @pytest.mark.parametrize(("name", "predictor"), [("exponential", "none"), ("gaussian", "secant")])
 def test_a_row_that_is_lost_keeps_its_last_weights_and_its_neighbour_sees_nothing(
     name: str, predictor: str, run: Callable[..., Any]
@@ -267,12 +226,11 @@ def test_every_way_of_a_chase_finds_the_same(name: str, law: str) -> None:
     spoilt = STATES.clone()
     spoilt[1, 4] = torch.inf
     whole = chase(spoilt, *given, **options)
-    for way in (in_pieces, by_steps):
-        found = way(spoilt, *given, **options)
-        for each in ("weights", "estimate", "estimate_before", "value", "coefficients"):
-            one, other = getattr(found, each), getattr(whole, each)
-            torch.testing.assert_close(one, other, rtol=1e-7, atol=1e-9, equal_nan=True)
-        assert torch.equal(found.diverged_at, whole.diverged_at)
+    found = in_pieces(spoilt, *given, **options)
+    for each in ("weights", "estimate", "estimate_before", "value", "coefficients"):
+        one, other = getattr(found, each), getattr(whole, each)
+        torch.testing.assert_close(one, other, rtol=1e-7, atol=1e-9, equal_nan=True)
+    assert torch.equal(found.diverged_at, whole.diverged_at)
     for pieces in (spoilt, iter(spoilt.split([1, 2, 4], 1))):
         alone = chase_weights(pieces, *given, **options)
         torch.testing.assert_close(alone.weights, whole.weights, rtol=1e-8, atol=1e-10)
@@ -293,37 +251,6 @@ def test_a_reach_beyond_one_is_warned_of_once_in_however_many_pieces() -> None:
     assert len(seen) == 1
     assert worst[1] > 1
     chase(0.4 * states[:1, :4], basis, Paper(), LAW)  # nothing to say
-
-
-def test_what_a_law_does_not_ask_for_is_not_computed() -> None:
-    class Asking(optim.SteepestDescent):
-        seen: Any = None
-
-        def step(self, objective: Any, weights: Tensor, state: Any) -> Any:
-            Asking.seen = objective.precomputed
-            return super().step(objective, weights, state)
-
-    basis, x = BASES["exponential"], STATES[:, 4:5]
-    gram = torch.stack([scaled_gram(basis, each[0]) for each in x])
-    row = torch.stack([basis(each, each[0])[0] / gain(basis, each[0]) for each in x])
-    eigenvalues = torch.linalg.eigvalsh(gram)[:, [0, -1]]
-    ideal = basis.ideal_weights(x[:, 0], Paper()) * gain(basis, x[:, 0]).unsqueeze(-1)
-    wanted = {
-        "extremes": eigenvalues,
-        "ideal": ideal,
-        "inverse": torch.linalg.inv(gram),
-        "row": row,
-        "sampled": Paper()(x[:, 0]),
-    }
-    names = list(wanted)
-    for needs in ((), *((name,) for name in names), (names[0], names[3]), tuple(names)):
-        Asking.needs = frozenset(needs)
-        chase(x, basis, Paper(), Asking(), inner_steps=1)
-        for name in names:
-            part = getattr(Asking.seen, name)
-            assert (part is None) is (name not in needs), (needs, name)
-            if part is not None:
-                torch.testing.assert_close(part, wanted[name], rtol=1e-8, atol=1e-9)
 
 
 def test_zero_weights_are_zero_also_where_their_unit_overflows() -> None:

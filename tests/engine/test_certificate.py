@@ -122,28 +122,6 @@ def test_the_a_priori_radius_of_the_papers_simulation() -> None:
     assert whole.after == 0
 
 
-@pytest.mark.parametrize(("before", "excess"), [(False, 0.35), (True, 0.01)])
-def test_the_inverses_of_the_a_priori_radius_are_its_inverses(before: bool, excess: float) -> None:
-    _, constants = circle()
-    law = optim.SteepestDescent()
-
-    def radius(dt: float, steps: int) -> float:
-        return theory.ultimate_bound(constants, law, dt=dt, inner_steps=steps)[0 if before else 1]
-
-    dt = theory.step_for_bound(constants, law, excess=excess, inner_steps=10, before=before)
-    assert radius(dt, 10) == pytest.approx(excess)
-    steps = theory.steps_for_bound(constants, law, excess=excess, dt=dt / 2, before=before)
-    assert steps is not None
-    assert radius(dt / 2, steps) <= excess < radius(dt / 2, steps - 1)
-
-
-def test_more_iterations_cannot_undo_the_drift_of_a_single_step() -> None:
-    _, constants = circle()
-    law = optim.SteepestDescent()
-    assert theory.steps_for_bound(constants, law, excess=1e-4, dt=0.01, before=True) is None
-    assert theory.ultimate_bound(constants, law, dt=1.0, inner_steps=1) == (math.inf, math.inf)
-
-
 def test_the_papers_own_step_is_four_orders_more_cautious() -> None:
     x = states(steps=157, dt=0.04)
     step = theory.paper_step(basis(), TARGET, x, SYSTEMS["oscillator"]().drift(x), excess=0.35)

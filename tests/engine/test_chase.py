@@ -15,7 +15,7 @@ from variants import KERNELS, LAWS, PAPER_LAW, by_turns, over
 
 import staf_torch as st
 from staf_torch import chase, chase_weights, systems, targets
-from staf_torch.engine import ChaseResult, chunk_length
+from staf_torch.engine import ChaseResult
 from staf_torch.numerics.linalg import condition_number
 from staf_torch.optim import SteepestDescent
 from staf_torch.targets import Cosine, Paper
@@ -106,15 +106,6 @@ def test_a_target_that_is_not_finite_somewhere_freezes_only_the_row_that_goes_th
     result = st.chase(states, basis_of("gaussian", 3, 0.1), hole, SteepestDescent())
     assert result.diverged.tolist() == [True, False]
     assert torch.isfinite(result.estimate[1]).all()
-
-
-def test_a_long_history_is_chased_in_pieces_of_some_64_megabytes() -> None:
-    basis = basis_of("exponential", 3)
-    lengths = [chunk_length(batch, basis, 8) for batch in (1, 10, 100, 10**9)]
-    assert lengths == sorted(lengths, reverse=True)
-    assert lengths[-1] == 1
-    for batch, length in zip((1, 10, 100), lengths, strict=False):
-        assert 2**24 < batch * length * 4 * 9 * 8 <= 2**26  # four matrices a time
 
 
 @over(["gaussian", "polynomial", "user_defined"])

@@ -16,7 +16,6 @@ from variants import Cauchy
 from staf_torch import (
     ExponentialKernel,
     GaussianKernel,
-    Kernel,
     StaFBasis,
     StateFollowingCenters,
     chase,
@@ -272,16 +271,3 @@ class Broken(UpdateLaw):
 def test_a_law_that_breaks_its_rules_is_named(law: UpdateLaw, message: str) -> None:
     with pytest.raises((TypeError, ValueError), match=message):
         chase(STATES, WELL, Paper(), law, inner_steps=1)
-
-
-class Distance(Kernel):
-    """A kernel by torch.cdist, which has no derivative in forward mode."""
-
-    def forward(self, x1: Tensor, x2: Tensor) -> Tensor:
-        return (-torch.cdist(x1, x2).square()).exp()
-
-
-def test_a_tangent_of_a_kernel_by_distances_is_refused() -> None:
-    basis = StaFBasis(Distance(), StateFollowingCenters(rings(3), 0.6))
-    with pytest.raises(NotImplementedError, match=r"`Tangent` predictor needs derivatives .* forward mode"):
-        chase(STATES, basis, Paper(), LAW, predictor=predictors.Tangent())

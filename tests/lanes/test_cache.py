@@ -279,17 +279,6 @@ def test_checkouts_of_one_version_share_a_library_and_others_do_not(
     assert len(calls()) == 2
 
 
-def test_a_long_program_is_built_by_another_compiler(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Options that spare one compiler half of its time are errors to another."""
-    name = "clang++"
-    if shutil.which(name) is None:
-        pytest.skip(f"there is no {name} here")
-    monkeypatch.setenv("CXX", name)
-    text = lanes.Program(lambda x, *_: (x + 1, x)).text(torch.zeros(1), steps=1)
-    compiler.machine_code(text + f"// {name}\n" * 2000)
-    assert len(list(cache.glob("lanes-*.so"))) == 1
-
-
 def test_the_cache_forgets_what_nobody_has_used_and_nothing_of_today(tmp_path: Path) -> None:
     day, now = 86_400, 1e9
 
@@ -308,12 +297,6 @@ def test_the_cache_forgets_what_nobody_has_used_and_nothing_of_today(tmp_path: P
     (tmp_path / "tmpdir").mkdir()
     os.utime(tmp_path / "tmpdir", (now - 3 * day,) * 2)
     kept = {"lanes-new.so", "lanes-mid.so", "trace-mid", "tmpnow", "notes.txt"}
-    assert left() == kept
-    assert left(largest=400) == kept
+    assert left() == left(largest=400) == kept
     assert left(largest=399) == kept - {"lanes-mid.so"}  # the oldest, and no more than there need be
     assert left(largest=0) == {"lanes-new.so", "tmpnow", "notes.txt"}
-    folder_of.used(tmp_path / "lanes-new.so")
-    assert (tmp_path / "lanes-new.so").stat().st_mtime > now
-    folder_of.used(tmp_path / "absent")  # nothing to note
-    folder_of.prune(tmp_path)  # by the clock of the machine the others are old
-    assert {path.name for path in tmp_path.iterdir()} == {"lanes-new.so", "notes.txt"}

@@ -127,7 +127,7 @@ def test_on_a_device_a_loop_of_few_steps_is_a_kernel() -> None:
 def test_a_history_without_room_on_a_device_comes_to_the_processor_with_the_same_bits(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    x, plant, cost = X0.repeat(5, 1), systems.VanDerPol(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+    x, plant = X0.repeat(5, 1), systems.VanDerPol()
     basis = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(st.rings(3), 0.3)).double()
     given = x[:, None] * torch.linspace(1, 0.5, 41, dtype=x.dtype)[:, None], lanes.Shared(torch.ones(41))
 
@@ -136,14 +136,13 @@ def test_a_history_without_room_on_a_device_comes_to_the_processor_with_the_same
         held = held + gain.unsqueeze(-1) * now[0] * now[1]
         return (held, count + 1), (held.sum(-1), count)
 
-    program, control = lanes.Program(step), lambda x: -x[..., 1:]
+    program = lanes.Program(step)
     start = x, torch.zeros(len(x), dtype=torch.long)
     law, paper = optim.SteepestDescent(), targets.Paper()
     calls: dict[str, tuple[int, Callable[[], Any]]] = {
         "program": (2600, lambda: program(start, given, x[:, 0], every=3)),
         "a fast plant": (2600, lambda: systems.simulate(plant, 20 * x, dt=0.05, steps=40)),
         "weights": (9000, lambda: vars(st.chase_weights(given[0], basis, paper, law))),
-        "loop": (6000, lambda: vars(adp.simulate(control, plant, cost, x, dt=0.01, steps=40))["state"]),
     }
     for name, (memory, call) in calls.items():
         with lanes.device.host():

@@ -11,10 +11,9 @@ from typing import Any
 import pytest
 import torch
 from functorch.compile import aot_module_simplified, make_boxed_func
-from helpers import tensor, uniform
+from helpers import tensor
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
-from torch.utils.data import DataLoader, Dataset
 
 import staf_torch as st
 from staf_torch import lanes, optim, systems, targets
@@ -224,22 +223,3 @@ def test_a_users_wrapper_of_a_call_is_read_and_not_the_call() -> None:
 
     found = whole(lambda x: doubled(PLANT, x, dt=0.01, steps=5))(X)
     assert torch.equal(found, 2 * systems.simulate(PLANT, X, dt=0.01, steps=5))
-
-
-class Ends(Dataset[Tensor]):
-    def __init__(self, starts: Tensor) -> None:
-        self.starts = starts
-
-    def __len__(self) -> int:
-        return len(self.starts)
-
-    def __getitem__(self, k: int) -> Tensor:
-        end: Tensor = LEARNED(self.starts[k : k + 1], steps=50)[0]
-        return end[0].detach()
-
-
-def test_workers_of_a_data_loader_run_programs() -> None:
-    starts = uniform(6, 2)
-    expected = LEARNED(starts, steps=50)[0]
-    loader = DataLoader(Ends(starts), batch_size=2, num_workers=2)
-    assert torch.equal(torch.cat(list(loader)), expected)

@@ -18,7 +18,6 @@ from torch import Tensor
 from torch.nn import functional
 
 from staf_torch import lanes
-from staf_torch.lanes.trace.decompositions import erfinv, sort
 
 pytestmark = pytest.mark.needs_compiler
 
@@ -229,69 +228,6 @@ def test_remainders_are_exact_whatever_the_quotient(dtype: torch.dtype) -> None:
                 torch.testing.assert_close(
                     found[name][:, 0, 0], wanted, rtol=0, atol=0, equal_nan=True, msg=name
                 )
-
-
-ZEROS: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
-    "itself": lambda x, y: x,
-    "minus": lambda x, y: -x,
-    "sum": lambda x, y: x + y,
-    "difference": lambda x, y: x - y,
-    "product": lambda x, y: x * y,
-    "square": lambda x, y: x * x,
-    "quotient": lambda x, y: x / (y * y + 1),
-    "least": lambda x, y: torch.minimum(x, y * y + 1),
-    "most": lambda x, y: torch.maximum(x, -y * y - 1),
-    "where it is": lambda x, y: torch.where(y > -9, x, 1.0),
-    "where it is not": lambda x, y: torch.where(y > 9, 1.0, x),
-    "exp": lambda x, y: x.exp() - 1.0,
-    "abs": lambda x, y: x.abs(),
-    "floor": lambda x, y: x.floor(),
-    "sine": lambda x, y: x.sin(),
-    "constant": lambda x, y: torch.where(y > 0, -0.0, y.abs()),
-}  # fmt: skip
-
-
-def test_a_zero_keeps_its_sign_and_loses_it_as_in_torch() -> None:
-    """Terms that add a zero may only go where no sign of a zero depends on them: 1/x tells."""
-
-    def step(carry: Tensor, now: Tensor, row: Tensor) -> tuple[Tensor, Tensor]:
-        x, y = row.unbind(-1)
-        found = [operation(x, y) for operation in ZEROS.values()]
-        every = [each for z in found for each in (z + 0.0, z - -0.0)]
-        return carry, torch.stack(every, dim=-1)
-
-    numbers = torch.tensor([0.0, -0.0, 1.0, -1.0], dtype=torch.float64)
-    x = torch.cartesian_prod(numbers, numbers)
-    program = lanes.Program(step)
-    assert program.compiles(x, x.unsqueeze(1), x)
-    found, wanted = (call(x, x.unsqueeze(1), x)[1] for call in (program, program.definition))
-    torch.testing.assert_close(1 / found, 1 / wanted, rtol=1e-14, atol=0)
-
-
-def test_the_inverse_of_the_error_function_is_one_up_to_its_ends() -> None:
-    near = 1 - torch.logspace(-15, 0, 200, dtype=torch.float64)
-    y = torch.cat((-near, near))
-    found = erfinv(y)
-    torch.testing.assert_close(torch.erf(found), y, rtol=0, atol=4e-16)
-    assert torch.equal(found.sign(), y.sign())
-    beyond = erfinv(torch.tensor([1.0, -1.0, 1.5, -2.0], dtype=torch.float64))
-    torch.testing.assert_close(
-        beyond, torch.tensor([math.inf, -math.inf, math.nan, math.nan]).double(), equal_nan=True
-    )
-
-
-@pytest.mark.parametrize(
-    ("shape", "dim", "descending"), [((7,), 0, True), ((4, 7), -1, False), ((2, 7, 3), 1, True)]
-)
-def test_entries_are_ordered_as_torch_does_along_any_dimension(
-    shape: tuple[int, ...], dim: int, descending: bool
-) -> None:
-    x = torch.randn(shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1)).mul(2).round()
-    x.view(-1)[3] = torch.nan
-    found, places = sort(x, dim, descending)
-    wanted = torch.sort(x, dim=dim, descending=descending, stable=True)
-    torch.testing.assert_close(found, wanted.values, rtol=0, atol=0, equal_nan=True)
-    assert torch.equal(places, wanted.indices)
 
 
 # Every operation as C, by one call of a C compiler.

@@ -292,20 +292,6 @@ def test_the_precision_of_a_program_is_the_highest_of_its_inputs() -> None:
         torch.testing.assert_close(found, wanted)
 
 
-def test_float64_inside_a_program_of_float32_is_carried_in_double_throughout() -> None:
-    def step(x: Tensor, u: Tensor, row: Any) -> tuple[Tensor, Tensor]:
-        inner = x.double()
-        x = (0.5 * inner.sin() + inner.cos().square()).float() + u
-        return x, x
-
-    program = lanes.Program(step)
-    x, u = drawn(5, 2).float(), drawn(5, 20, 2).float()
-    assert program.compiles(x, u)
-    for one, other in zip(program(x, u), program.definition(x, u), strict=True):
-        assert one.dtype == torch.float32
-        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
-
-
 @pytest.mark.parametrize(("kind", "given"), [(torch.bfloat16, torch.float32), (torch.float16, torch.float64)])
 def test_half_precision_runs_by_its_definition(kind: torch.dtype, given: torch.dtype) -> None:
     program = lanes.Program(lambda x, u, row: ((x.to(kind) / 3).to(given) + u, x))
@@ -316,55 +302,6 @@ def test_half_precision_runs_by_its_definition(kind: torch.dtype, given: torch.d
 
 
 # Carries and histories.
-
-
-def test_a_carry_of_many_entries_stays_in_memory() -> None:
-    """Matrices that change places, a part of one that moves on, flags, and numbers beside them."""
-    rows = 21
-    a, b = torch.randn(2, rows, 9, 9).double().unbind()
-
-    def step(carry: Any, u: Tensor, _: object) -> tuple[Any, Any]:
-        one, other, some, last = carry
-        moved = torch.cat((one[:, 1:], 0.5 * one[:, :1] + u[:, None, None]), dim=1)
-        moved = torch.where(some, moved, -moved).roll(1, -1)
-        return (other, moved, other > one, one[:, 3, 4]), (one.sum((-2, -1)), last)
-
-    start = a, b, a > b, a[:, 0, 0]
-    program, u = lanes.Program(step), torch.randn(rows, 6).double()
-    assert program.compiles(start, u)
-    (after, out), (wanted, known) = program(start, u), program.definition(start, u)
-    for found, right in zip((*after, *out), (*wanted, *known), strict=True):
-        torch.testing.assert_close(found, right, rtol=1e-13, atol=1e-13)
-
-
-def held(carry: tuple[Tensor, Tensor, Tensor], now: Tensor, row: object) -> tuple[object, Tensor]:
-    """A row of which a number is not finite stays behind, as the rows of a chase do."""
-    x, gain, lost_at = carry
-    new = x * (now - gain).exp()
-    fine = torch.isfinite(new) & (lost_at < 0)
-    lost_at = torch.where(fine | (lost_at >= 0), lost_at, now)
-    x, gain = torch.where(fine, new, x), torch.where(fine, now, gain)
-    return (x, gain, lost_at), x * gain - now
-
-
-HELD = lanes.Program(held)
-
-
-def test_rows_that_stay_behind_keep_their_numbers_and_no_other_row_sees_them() -> None:
-    rows = 9
-    now = torch.rand(rows, 50).double()
-    now[::3, 20] = torch.nan
-    carry = torch.ones(rows).double(), torch.zeros(rows).double(), -torch.ones(rows).double()
-    (x, gain, lost_at), out = HELD(carry, now)
-    (wanted, wanted_gain, wanted_lost), history = HELD.definition(carry, now)
-    torch.testing.assert_close(x, wanted, rtol=1e-13, atol=0)
-    torch.testing.assert_close(out, history, rtol=1e-12, atol=1e-15, equal_nan=True)
-    torch.testing.assert_close(lost_at, wanted_lost, equal_nan=True, rtol=0, atol=0)
-    assert torch.equal(gain, wanted_gain)
-    for row in range(rows):
-        alone = tuple(part[row : row + 1] for part in carry)
-        found = HELD(alone, now[row : row + 1])[1]
-        assert same_bits(found.nan_to_num(), out[row : row + 1].nan_to_num())
 
 
 def test_a_long_history_that_bypasses_the_caches_is_that_of_its_pieces() -> None:

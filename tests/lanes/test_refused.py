@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import random
 import time
 from collections.abc import Callable
@@ -162,20 +161,11 @@ def test_what_is_zero_but_for_rounding_at_a_point_is_tried_beside_it(
         k = (-0.5 * (x.unsqueeze(-2) - known).square().sum(-1)).exp()
         return 1 - (k @ inverse * k).sum(-1)  # at x = 0 two rows are summed in another order than one
 
-    def hidden(x: Tensor) -> Tensor:  # beside a number that would hide it
-        return variance(x) + x.mean() + torch.maximum(x, torch.full_like(x, -1e30)).sum(-1)
-
     x1 = torch.cat((x0[:1], 0.1 * torch.eye(2, dtype=torch.float64)))
     for name, function, x, compiles in (
         ("a variance", variance, x0, True),
         ("a variance", variance, x1, True),
-        ("a hidden mean", hidden, x1, False),
-        (
-            "zero among rows",
-            lambda x: variance(x) + (x == 0).all(-1).any() * x.new_ones(()) * len(x),
-            x1,
-            False,
-        ),
+        ("beside a mean", lambda x: variance(x) + x.mean(), x1, False),
     ):
         assert Program(lambda c, _, __, f=function: (c, f(c)), name=name).compiles(x, steps=1) is compiles
         assert ("beside another row" in caplog.text) is not compiles
@@ -200,28 +190,6 @@ def test_loops_are_tried_by_a_few_passes_and_all_calls_are_seen(caplog: pytest.L
             torch.testing.assert_close(program(rows, (), (), steps=1)[0], torch.full_like(rows, 0.2))
 
 
-Step = Callable[[Tensor, Any, Any], tuple[Any, Any]]
-
-
-def mixed_by(share: float, row: int) -> Step:
-    """A step in which one of two rows differs from itself alone by a share of its size."""
-
-    def step(carry: Tensor, now: Any, other: Any) -> tuple[Tensor, Any]:
-        after = carry.clone()
-        after[row if len(carry) > 1 else 0] *= 1.0 + share * (len(carry) > 1)
-        return after, ()
-
-    return step
-
-
-@pytest.mark.parametrize(("row", "share", "compiles"), [(0, 0.009, True), (0, 0.011, False), (1, 0.5, False)])
-def test_a_row_that_another_changes_by_a_hundredth_gives_a_step_away(
-    row: int, share: float, compiles: bool
-) -> None:
-    x = torch.tensor([[1.0, 2.0], [3.0, 4.0]], dtype=torch.float64)
-    assert Program(mixed_by(share, row)).compiles(x, steps=1) is compiles
-
-
 def test_a_step_that_writes_into_its_inputs_is_tried_with_copies() -> None:
     def step(carry: Tensor, now: Any, row: Any) -> tuple[Tensor, Any]:
         for part in (carry, *now):
@@ -234,17 +202,6 @@ def test_a_step_that_writes_into_its_inputs_is_tried_with_copies() -> None:
     assert torch.equal(Program(step)(*inputs)[0], torch.ones(4, 2))
     for one, other in zip((inputs[0], inputs[1][0], inputs[1][1].tensor), before, strict=True):
         assert torch.equal(one, other)
-
-
-def test_other_results_among_others_are_found_out() -> None:
-    count = itertools.count()
-    steps: dict[str, Step] = {
-        "more": lambda c, n, r: (c, (c,) * len(c)),
-        "another shape": lambda c, n, r: (c, c.repeat(1, len(c))),
-        "more each time": lambda c, n, r: (c, (c,) * (1 + next(count))),
-    }
-    for name, step in steps.items():
-        assert not Program(step, name=name).compiles(X, steps=1)
 
 
 # What has no scalar form.
@@ -320,23 +277,6 @@ def test_a_network_of_another_precision_is_named_with_what_to_write(kind: torch.
             ValueError, match=r"^one of mine: its inputs are torch.float64, .* `net.to\(torch"
         ):
             call()
-
-
-def test_an_error_while_tracing_leaves_the_definition(caplog: pytest.LogCaptureFixture) -> None:
-    class Odd:
-        def __init__(self) -> None:
-            self.called = 0
-
-        def __call__(self, x: Tensor) -> Tensor:
-            self.called += 1
-            if self.called == 1:  # a program is traced first
-                raise KeyError("lost while tracing")
-            return 2 * x
-
-    odd = Odd()
-    program = Program(lambda carry, now, row: (carry, odd(row)), name="one with an error")
-    assert torch.equal(program(X, X.unsqueeze(1), X)[1][:, 0], 2 * X)
-    assert "KeyError" in caplog.text
 
 
 def test_a_text_that_would_take_a_compiler_minutes_is_not_given_to_it(

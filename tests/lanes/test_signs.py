@@ -6,17 +6,13 @@ import io
 import logging
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
 import pytest
 from command_line import environment
 
-from staf_torch import signs
 from staf_torch.signs import Sign
-
-WAIT = signs.FIRST + 0.6
 
 
 class Terminal(io.StringIO):
@@ -45,23 +41,6 @@ def test_a_terminal_has_a_bar_under_the_log_that_is_wiped_in_the_end(monkeypatch
     assert found.startswith("\r 25 %|######                  | a sum: 25 % of 8 parts, ")
     assert "\r\x1b[Kabove\n\r 25 %|" in found
     assert found.endswith("\r\x1b[K")
-
-
-def test_short_calls_say_nothing_however_many(capsys: pytest.CaptureFixture[str]) -> None:
-    @Sign("short")
-    def short() -> None:
-        time.sleep(0.1)
-
-    end = time.monotonic() + WAIT
-    while time.monotonic() < end:
-        short()
-    assert capsys.readouterr() == ("", "")
-    for _ in range(20):
-        time.sleep(0.1)
-        if not any(thread.name == "staf_torch.signs" for thread in threading.enumerate()):
-            break
-    else:
-        pytest.fail("the thread that looks goes on")
 
 
 def test_a_script_sees_what_is_going_on_and_how_far_it_is_and_not_the_calls_of_its_workers(

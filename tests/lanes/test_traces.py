@@ -265,15 +265,6 @@ def test_a_number_that_the_step_reads_decides_whether_a_trace_serves(cache: Path
         right(program)
 
 
-def test_the_latest_programs_are_kept_and_no_more() -> None:
-    kept, modules = SharedPrograms("a test", most=2), [nn.Sequential(*[nn.Tanh()] * k) for k in (1, 2, 3)]
-    one, two = (of(kept, module)[0] for module in modules[:2])
-    assert of(kept, modules[0])[0] is one  # which is now the latest
-    of(kept, modules[2])
-    assert of(kept, modules[0])[0] is one
-    assert of(kept, modules[1])[0] is not two
-
-
 def twice(self: nn.Module, x1: Tensor, x2: Tensor) -> Tensor:
     return 2 * (x1 @ x2.mT)
 

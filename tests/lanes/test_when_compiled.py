@@ -57,30 +57,6 @@ class Enough(Exception):  # noqa: N818
     """A test has seen what it was to see."""
 
 
-class Noisy(Chain):
-    drawn: list[float]
-    wanted: list[float]
-
-    def drift(self, x: Tensor) -> Tensor:
-        self.drawn.append(torch.rand(()).item() if x.any() else 0.0)
-        if self.wanted and self.drawn[-len(self.wanted) :] == self.wanted:
-            raise Enough
-        return super().drift(x) * (1 + self.drawn[-1])
-
-
-def test_a_loop_that_cannot_be_compiled_draws_what_it_draws_in_plain_torch() -> None:
-    """Its first step was counted and undone."""
-    plant = Noisy(1000)
-    plant.drawn, plant.wanted = [], []
-    torch.manual_seed(3)
-    run(plant, 3, compile=False)
-    plant.drawn, plant.wanted = [], plant.drawn[-12:]
-    torch.manual_seed(3)
-    with pytest.raises(Enough):
-        run(plant, 200)
-    assert len(plant.drawn) >= 4 + 12  # of the step that was undone, and of those that count
-
-
 class Swing(systems.Pendulum):
     """A plant of a kind of its own: short calls are counted by kind."""
 

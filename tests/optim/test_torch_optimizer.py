@@ -8,14 +8,13 @@ import re
 
 import pytest
 import torch
-from helpers import random_positive_definite, uniform
+from helpers import uniform
 from helpers_laws import TARGET, basis, quadratic
 from torch import Tensor, nn
 from variants import LAWS, by_turns
 
 from staf_torch import optim
 from staf_torch.optim.objective import NativeError
-from staf_torch.optim.torch_optimizer import LossObjective
 
 USABLE = {name: law for name, law in LAWS.items() if name != "normalised lms"}
 
@@ -181,38 +180,6 @@ def test_parameters_that_are_coupled_are_refused_by_name() -> None:
     (mine,) = copied.param_groups[0]["params"]
     copied.step(lambda: mine.square().sum())
     assert not bool(mine.any())
-
-
-GRAM, VALUES = random_positive_definite(1, 4, size=3), uniform(4, 3, seed=2)
-
-
-def loss_of(a: Tensor) -> Tensor:
-    """a'K a - 2 V'a + 7, a number a row."""
-    return ((a.unsqueeze(-2) @ GRAM).squeeze(-2) * a).sum(-1) - 2 * (VALUES * a).sum(-1) + 7
-
-
-def made(at: Tensor, slope: Tensor | None = None) -> tuple[LossObjective, nn.Parameter]:
-    parameter = nn.Parameter(at)
-    (found,) = torch.autograd.grad(loss_of(parameter).sum(), parameter, create_graph=True)
-    return LossObjective(parameter, found if slope is None else slope), parameter
-
-
-def test_a_loss_has_the_matrix_and_the_vector_of_its_quadratic() -> None:
-    found, _ = made(uniform(4, 3, seed=3))
-    v = uniform(4, 3, seed=4)
-    torch.testing.assert_close(found.gram, GRAM)
-    torch.testing.assert_close(found.values, VALUES)
-    torch.testing.assert_close(found.curvature(v), (GRAM @ v.unsqueeze(-1)).squeeze(-1))
-    torch.testing.assert_close(found.descent(v), 2 * (VALUES - (GRAM @ v.unsqueeze(-1)).squeeze(-1)))
-    torch.testing.assert_close(found.minimiser(), torch.linalg.solve(GRAM, VALUES))
-    torch.testing.assert_close(found.solve(v), torch.linalg.solve(GRAM, v))
-    values = torch.linalg.eigvalsh(GRAM)
-    low, high = found.spectrum()
-    torch.testing.assert_close(torch.stack((low, high), -1), values[:, [0, -1]])
-    assert found.values is found.values
-    assert not found.curvature(v).requires_grad
-    with pytest.raises(ValueError, match=r"^A loss has no sample at a state\.$"):
-        found.sample()
 
 
 def test_a_loss_of_several_parameters_moves_each_and_skips_what_it_does_not_use() -> None:
