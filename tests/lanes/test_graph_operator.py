@@ -80,8 +80,6 @@ def test_a_model_of_a_network_a_program_and_a_loss_is_one_graph_with_the_gradien
     assert same(model, compiled, *model.parameters())
     found.append(compiled(X))
     assert len({value.item() for value in found}) == 4
-    model.gain.requires_grad_(False)
-    assert same(model, compiled, *model.net.parameters())
 
 
 def test_a_gradient_is_that_of_the_numbers_of_its_forward_pass() -> None:
@@ -169,8 +167,7 @@ def every(x: Tensor) -> Tensor:
     prepared = PREPARED(x)[1].square().sum()
     moved = GAIN * systems.simulate(PLANT, x, dt=0.01, steps=12).square().mean() + POLICY(x).square().sum()
     chased = st.chase(STATES + x[:, None], BASIS, TARGET, LAW).weights.square().mean()
-    weights = st.chase_weights(STATES + x[:, None], BASIS, TARGET, LAW).weights.mean()
-    return checkpoint(two, x, use_reentrant=False) + prepared + moved + chased + weights  # type: ignore[no-any-return]
+    return checkpoint(two, x, use_reentrant=False) + prepared + moved + chased  # type: ignore[no-any-return]
 
 
 def test_a_call_of_any_kind_is_an_operator_of_a_graph() -> None:

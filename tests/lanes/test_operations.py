@@ -270,7 +270,7 @@ FORMS: dict[str, tuple[Callable[..., Any], tuple[Tensor, ...]]] = {
     "products": (forms.products, (x(3, 2), x(2, 3))),
     "slopes": (forms.slopes, (x(3, 2), x(2, 3))),
     "movements": (forms.movements, (x(3, 3),)),
-    **{f"choices of {n}": (forms.choices, (x(n, n), i(n))) for n in (3, 6)},
+    "choices": (forms.choices, (x(3, 3), i(3))),
     "replaced": (forms.replaced, (x(4),)),
     "orders": (forms.orders, (x(3, 4),)),
     "large": (forms.large, (x(65),)),
