@@ -23,9 +23,10 @@ from staf_torch.sweeps.callbacks import (
     TensorBoardTracker,
     Tracker,
     TrackRuns,
+    claim,
     tracker,
 )
-from staf_torch.sweeps.lock import give_back, held
+from staf_torch.sweeps.lock import TakenError, give_back, held
 from staf_torch.tables import RecordedRun, collect
 
 
@@ -65,6 +66,20 @@ def test_sweeps_of_the_same_moment_have_directories_of_their_own_and_note_what_w
     with ThreadPoolExecutor(4) as pool:
         taken = set(pool.map(begin, range(4)))
     assert taken == {"sweep", "sweep-2", "sweep-3", "sweep-4"}
+
+
+def test_a_directory_that_was_asked_for_is_taken_or_refused(tmp_path: Path) -> None:
+    place = tmp_path / "sweep"
+    place.mkdir()
+    (place / "notes.txt").write_text("")
+    asked = settings(place, f"hydra.sweep.dir={place}")
+    claim(asked)  # where something else is
+    with pytest.raises(TakenError):
+        claim(asked)
+    give_back(place)
+    (place / "sweep.json").write_text("{}")
+    with pytest.raises(ValueError, match=rf"{place} holds a sweep already.*sweep.resume={place}`"):
+        claim(asked)
 
 
 def test_a_file_in_the_way_is_named(tmp_path: Path) -> None:

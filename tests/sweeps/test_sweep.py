@@ -179,6 +179,8 @@ def own(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
         raise RuntimeError("the second seed is unlucky")
     if harm == "Ctrl-C" and not Path("go on").exists():
         raise KeyboardInterrupt
+    if harm == "a job gone":
+        shutil.rmtree(directory.parent / "0")
     node = HydraConfig.get()
     assert node.runtime.output_dir == str(directory.absolute())
     assert json.loads((directory / "run.json").read_text())["status"] == "running"
@@ -247,6 +249,12 @@ def test_an_interrupted_sweep_says_how_to_resume(place: Path) -> None:
     assert code == 0, err
     assert "3 of 3 jobs completed" in out
     assert len(rows(directory)) == 3
+
+
+def test_results_that_are_taken_away_are_no_completed_jobs(place: Path) -> None:
+    directory, said = sweep(place, "gone", *OWN, "seed=range(2)", "+harm=a job gone", code=1)
+    assert "the results of job 0 (task=test_sweep.own" in said
+    assert [run.parent.name for run in directory.glob("*/run.json")] == ["1"]
 
 
 @pytest.mark.parametrize(

@@ -263,7 +263,7 @@ def test_rows_of_other_settings_or_modules_are_refused_and_stay(place: Path) -> 
             "conf/kernel/own.yaml",
             "1.5",
             "2.5",
-            "job 0 (task=mine.Squares kernel=own seed=0 trajectories=0) would be made otherwise now",
+            "job 0 (task=mine.Squares kernel=own seed=0 trajectories=0 history=True) would be made otherwise",
         ),
         ("mine.py", "SCALE = 1.0", "SCALE = 2.0", "rows that were made with other settings or source"),
     ):
