@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import pickle
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,6 @@ import staf_torch as st
 from staf_torch import adp, deploy, lanes, systems
 from staf_torch.adp.near_optimal_policy import NearOptimal
 from staf_torch.adp.policies.sampled_rollout import SampledRollout
-from staf_torch.deploy.c_header import runner_c
 
 
 def turn(x: np.ndarray, u: np.ndarray) -> np.ndarray:
@@ -48,7 +46,8 @@ def two_states() -> NearOptimal:
 def limited() -> dict[bool, NearOptimal]:
     """Of the mass with |u| <= 1, by whether it plans: what plans is traced once."""
     return {
-        plan: adp.near_optimal(DOUBLE, COST, dt=0.25, low=-1.0, high=1.0, plan=plan) for plan in (False, True)
+        plan: adp.near_optimal(DOUBLE, COST, dt=0.25, horizon=horizon, low=-1.0, high=1.0, plan=plan)
+        for plan, horizon in ((False, 4.0), (True, 3.0))
     }
 
 
@@ -97,7 +96,7 @@ def test_where_a_bound_holds_the_base_at_the_end_its_own_control_is_kept() -> No
 @torch.no_grad()
 def test_report_says_what_was_chosen_and_how_good_it_is(two_states: NearOptimal) -> None:
     policy = two_states
-    report = policy.report(states=3, spread=0.5, full=True, optimum=True)
+    report = policy.report(states=2, spread=0.5, full=True, optimum=True)
     assert report["dt"] == 0.1
     assert report["centers"] == 3
     assert report["spectral_radius"] < 1 < report["largest_period"] / 0.1
@@ -108,62 +107,40 @@ def test_report_says_what_was_chosen_and_how_good_it_is(two_states: NearOptimal)
     assert report["microseconds"] > 0
     assert report["strained"] is None
     assert report["left_out"] == ""
-    short = policy.report(states=3, spread=0.5)
+    short = policy.report(states=2, spread=0.5)
     assert short["left_out"] == (
         "good_spread, microseconds: report(full=True); over_optimum: report(optimum=True)"
     )
-    assert {name for name, value in short.items() if value is None} - {"strained"} == {
-        *("good_spread", "microseconds", "over_optimum_median", "over_optimum_max")
-    }
+    assert (short["good_spread"], short["over_optimum_max"]) == (None, None)
     assert short["over_base_max"] == pytest.approx(report["over_base_max"], rel=1e-9)
-
-
-@pytest.mark.needs_compiler
-@torch.no_grad()
-def test_exported_policy_is_the_policy(tmp_path: Path) -> None:
-    cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1, low=-2.0, high=1.5)
-    given: dict[str, Any] = {"dt": 0.05, "horizon": 0.4, "reach": "local"}
-    with pytest.raises(ValueError, match=r"`policy_of\(controller=...\)` must not plan anew in every state"):
-        deploy.policy_of(adp.near_optimal(systems.Pendulum(), cost, **given, plan=True))
-    policy = deploy.policy_of(adp.near_optimal(systems.Pendulum(), cost, **given))
-    x = drawn(2, 0.5, 40)
-    deploy.export_c(policy, x[:1], tmp_path / "staf.h", ["u"])
-    (u,) = runner_c(tmp_path / "staf.h", [1], torch.float64)(x)
-    torch.testing.assert_close(u, policy(x), rtol=1e-9, atol=1e-9)
 
 
 def test_bad_arguments_are_refused_by_name() -> None:
     with pytest.raises(ValueError, match=r"`near_optimal\(dt=...\)` must be given, s.*no period of its own"):
         adp.near_optimal(systems.Pendulum(), COST)
-    with pytest.raises(ValueError, match=r"`near_optimal\(horizon=...\)` must be positive"):
-        adp.near_optimal(systems.Pendulum(), COST, dt=0.1, horizon=-1.0)
     with pytest.raises(ValueError, match=r"`SampledRollout\(steps=...\)` must be at least 4"):
         adp.near_optimal(systems.Pendulum(), COST, dt=0.1, horizon=0.2)
+    with pytest.raises(ValueError, match=r"`policy_of\(controller=...\)` must not plan anew in every state"):
+        deploy.policy_of(adp.near_optimal(DOUBLE, COST, dt=0.25, low=-1.0, high=1.0, plan=True))
 
 
 def test_plan_takes_over_where_the_lqr_would_meet_a_bound(limited: dict[bool, NearOptimal]) -> None:
     """A mass at 2 m with |u| <= 1: the LQR's rollouts overshoot; the plan is the optimum of its horizon."""
-    plant, policy = DOUBLE, limited[True]
+    policy = limited[True]
     x = torch.tensor([[2.0, 0.5], [0.05, 0.0], [-2.0, -0.5]], dtype=torch.float64)
     assert policy.planner is not None
     assert policy.planner.strained(x).tolist() == [True, False, True]
     u = policy(x)
-    search = adp.BoxDDP(policy.planner.problem, steps=policy.steps)
-    best = search.solve(x[::2])
+    best = adp.BoxDDP(policy.planner.problem, steps=policy.steps, compile=False).solve(x[::2])
     torch.testing.assert_close(u[::2], best.control[:, 0], rtol=0, atol=1e-3)
     torch.testing.assert_close(u[0], -u[2])
     torch.testing.assert_close(u[1], policy.control(x[1]), rtol=0, atol=1e-9)
     assert torch.equal(policy(x[1]), u[1])
-    loop = policy.controller()  # carries its plan
-    run = adp.simulate(loop, plant, policy.cost, x, dt=0.25, steps=40, compile=False)
-    search.steps = 40  # by the same programs
-    whole = search.solve(x)
-    torch.testing.assert_close(run.cost, whole.cost, rtol=1e-4, atol=1e-6)
-    assert isinstance(adp.near_optimal(plant, COST, dt=0.25, plan=True).controller(), adp.Feedback)
-    again = pickle.loads(pickle.dumps(policy))
-    torch.testing.assert_close(again(x), u)
-    assert adp.near_optimal(plant, COST, dt=0.25, plan=True).planner is None
+    free = adp.near_optimal(DOUBLE, COST, dt=0.25, plan=True)
+    assert isinstance(free.controller(), adp.Feedback)
+    assert free.planner is None
     assert limited[False].planner is None
+    torch.testing.assert_close(pickle.loads(pickle.dumps(policy))(x), u)
 
 
 @torch.no_grad()
@@ -180,7 +157,7 @@ def test_loop_carries_a_plan_only_where_the_lqr_would_meet_a_bound(
     )
     assert torch.equal(alone.state[0], run.state[0])
     assert planner.strained(run.state[0]).tolist() == [True] * 8 + [False] * 3
-    best = adp.BoxDDP(planner.problem, steps=60).solve(x)
+    best = adp.BoxDDP(planner.problem, steps=40).solve(x)
     torch.testing.assert_close(run.control[:, :10], best.control[:, :10], rtol=0, atol=1e-2)
     near, none = x[1:2], x.new_zeros(1, 0)
     u, carried = loop.step(near, loop.init(near), none, 0.25)
@@ -189,7 +166,11 @@ def test_loop_carries_a_plan_only_where_the_lqr_would_meet_a_bound(
     torch.testing.assert_close(pushed, best.control[:1, 0], rtol=0, atol=1e-2)
     lost, _ = loop.step(near / 0.0, carried, none, 0.25)  # nothing is planned from there
     assert bool(lost.isnan().all())
-    assert isinstance(adp.near_optimal(plant, COST, dt=0.25).controller(), adp.Feedback)
+    other, far = policy.controller(), x[:1]  # shares no plan with the first, and holds the same programs
+    assert torch.equal(
+        other.step(far, other.init(far), none, 0.25)[0], loop.step(far, loop.init(far), none, 0.25)[0]
+    )
+    assert policy.plans() is planner
 
 
 @torch.no_grad()
@@ -215,12 +196,12 @@ def test_another_control_than_the_bases_promises_less_over_both_horizons(two_sta
 
 
 class Gap(systems.ControlAffineSystem):
-    """x' = x (1 + 20 x^2 / (x^2 + 0.05^2)) + u: some centimetres from rest the LQR holds it no more."""
+    """x' = x (1 + 20 x^2 / (x^2 + 0.2^2)) + u: some decimetres from rest the LQR holds it no more."""
 
     dim, inputs = 1, 1
 
     def drift(self, x: Tensor) -> Tensor:
-        return x * (1 + 20 * x**2 / (x**2 + 0.05**2))
+        return x * (1 + 20 * x**2 / (x**2 + 0.2**2))
 
     def effectiveness(self, x: Tensor) -> Tensor:
         return torch.ones(1, 1, dtype=x.dtype).expand(*x.shape, 1)
@@ -230,9 +211,10 @@ def test_report_finds_the_region_of_a_plant_in_small_units() -> None:
     policy = adp.near_optimal(
         Gap(), adp.QuadraticCost(25.0, 1.0, dim=1, inputs=1), dt=0.05, horizon=0.2, reach="local", substeps=1
     )
-    report = policy.report(states=2, full=True)
+    with lanes.compiling("always"):
+        report = policy.report(states=2, full=True)
     assert report["regulated"] == 0  # in the box of 1
-    assert 1 / 256 <= report["good_spread"] <= 1 / 32
+    assert 1 / 64 <= report["good_spread"] <= 1 / 8
 
 
 def torch_turn(x: Tensor, u: Tensor) -> Tensor:
@@ -264,34 +246,6 @@ def test_simulator_is_followed_in_numpy_to_the_same_promise(
     torch.testing.assert_close(pickle.loads(pickle.dumps(hidden))(x), hidden(x), rtol=0, atol=0)
 
 
-@torch.no_grad()
-def test_controllers_of_a_policy_share_no_plan(limited: dict[bool, NearOptimal]) -> None:
-    policy = limited[False]
-    one, other = policy.controller(), policy.controller()
-    far, near = tensor([[3.0, 1.0]]), tensor([[0.05, 0.0]])
-    none = far.new_zeros(1, 0)
-    plan, idle = one.init(far), other.init(near)
-    u, after = one.step(far, plan, none, 0.25)
-    again, _ = other.step(near, idle, none, 0.25)
-    assert torch.equal(again, policy(near))
-    assert torch.equal(one.step(far, plan, none, 0.25)[0], u)  # nor is a plan changed by those who follow it
-    assert torch.equal(one.step(near, after, none, 0.25)[0], policy(near))
-    copied = pickle.loads(pickle.dumps(policy)).controller()
-    torch.testing.assert_close(copied.step(far, copied.init(far), none, 0.25)[0], u, rtol=0, atol=1e-6)
-    assert policy.plans() is policy.plans()  # it holds programs
-
-
-@torch.no_grad()
-@pytest.mark.parametrize("plan", [True, False])
-def test_states_are_known_from_which_the_lqr_would_meet_a_bound(
-    plan: bool, limited: dict[bool, NearOptimal]
-) -> None:
-    planner = limited[plan].plans()
-    assert planner is not None
-    for spread, share in ((1e-3, 0.0), (1e3, 1.0)):
-        assert float(planner.strained(drawn(2, spread, 4)).double().mean()) == share
-
-
 def made(decay: float = 2.0, dt: float = 0.1, **given: Any) -> NearOptimal:
     """Of a mode that the feedback hardly moves."""
     cost = adp.QuadraticCost(1e-9, 1.0, dim=1, inputs=1, **given)
@@ -313,9 +267,7 @@ def test_plans_are_made_where_there_are_bounds_a_plant_in_torch_and_no_discount(
         assert planner.steps == steps
 
 
-@pytest.mark.parametrize(
-    ("seconds", "steps"), [(1.0, 12), (1.21, 12), (1.26, 16), (1.6, 16), (1.64, 16), (5.9, 60), (60.0, 60)]
-)
+@pytest.mark.parametrize(("seconds", "steps"), [(1.21, 12), (1.26, 16), (60.0, 60)])
 def test_a_horizon_is_two_time_constants_in_four_quarters_of_whole_periods(
     seconds: float, steps: int
 ) -> None:
@@ -355,8 +307,7 @@ def bounded(discount: float) -> adp.QuadraticCost:
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("discount", [0.0, 0.5])
-@pytest.mark.parametrize(("steps", "part"), [(4, 3), (5, 4), (10, 8)])
+@pytest.mark.parametrize(("steps", "part", "discount"), [(4, 3, 0.0), (5, 4, 0.5)])
 def test_a_promise_is_the_sum_over_the_horizon_and_over_three_quarters_of_it(
     steps: int, part: int, discount: float
 ) -> None:
@@ -373,18 +324,11 @@ def test_a_promise_is_the_sum_over_the_horizon_and_over_three_quarters_of_it(
     torch.testing.assert_close(found.part, wanted[part - 1])
     last = base(x)
     assert torch.equal(found.free, ((last > held.bounds.low) & (last < held.bounds.high)).all(-1))
-    for one, some in ((start[1], (1,)), (start[0, 2], (0, 2))):
-        for mine, of_all in zip(held.rollout(one), found, strict=True):
-            torch.testing.assert_close(mine, of_all[some])
+    for mine, of_all in zip(held.rollout(start[0, 2]), found, strict=True):
+        torch.testing.assert_close(mine, of_all[0, 2])
     after, paid = held.holding(start, held.control(start))
     ahead = held.rollout(after).whole
     torch.testing.assert_close(held.value(start), paid + math.exp(-discount * 0.2) * ahead)
-
-
-def test_a_control_at_either_bound_is_not_free() -> None:
-    for level, free in ((0.5, False), (0.499, True), (-1.0, False), (-0.999, True), (0.7, False)):
-        held = sampled(bounded(0.3), lambda x, u=level: x.new_tensor([u, 0.1]).expand(*x.shape[:-1], 2))
-        assert held.rollout(torch.zeros(1, 3).double()).free.tolist() == [free]
 
 
 @pytest.mark.parametrize("limits", [(None, None), (-0.05, 0.02)])
@@ -421,19 +365,6 @@ def test_an_input_that_moves_nothing_is_left_as_it_is() -> None:
     torch.testing.assert_close(policy(x)[:, 1], torch.zeros(4).double(), rtol=0, atol=1e-8)
 
 
-@torch.no_grad()
-def test_rollouts_of_one_held_state_cost_what_its_riccati_equation_says() -> None:
-    plant, cost = systems.Linear([[-0.5]], [[1.0]]), adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1)
-    value = math.sqrt(0.5**2 + 1) - 0.5
-    held, x = adp.near_optimal(plant, cost, dt=0.1, low=-2.0, high=0.25), tensor([[0.08], [-0.03]])
-    p = float(held.lqr.p)
-    assert value < p < 1.01 * value
-    torch.testing.assert_close(held.rollout(x).whole, p * x.square().squeeze(-1), rtol=1e-5, atol=0)
-    edge = -0.25 / float(held.lqr.k)
-    around = tensor([[0.999 * edge], [1.001 * edge], [-7.0]])
-    assert held.meets_bound(around).tolist() == [[0.0], [1.0], [1.0]]
-
-
 def test_a_bound_is_met_where_the_base_reaches_it_within_the_horizon() -> None:
     line, cost = systems.Linear([[0.0]], [[1.0]]), adp.QuadraticCost(1.0, 1.0, 1, 1, low=-1.0, high=2.0)
     basis = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(tensor([[1.0], [-1.0]]), 0.1))
@@ -450,30 +381,3 @@ def test_a_bound_is_met_where_the_base_reaches_it_within_the_horizon() -> None:
     # It grows by a half a period: 0.4, 0.6, 0.9, 1.35, 2.025 in the fifth.
     assert meets(1.0, 0.4) == [0.0]
     assert meets(1.0, 0.4, steps=5) == [1.0]
-
-
-def test_a_repr_of_a_few_lines_says_what_a_user_needs() -> None:
-    plant, near = (
-        systems.Pendulum(),
-        adp.QuadraticCost(1.0, 2.0, dim=2, inputs=1, low=-8.0, target=[0.0, 0.0]),
-    )
-    lqr = adp.LQR(systems.Linear([[0.0]], [[1.0]]), adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1), period=0.1)
-    shown = {
-        plant: "Pendulum(2 states, 1 input, damping=0.1)",
-        systems.StepPlant(
-            lambda x, u: x + u, dim=1, inputs=1, dt=0.1
-        ): "StepPlant(1 state, 1 input, period=0.1 s)",
-        near: "QuadraticCost(2 states, 1 input, state=diag(1, 1), control=[[2]], low=[-8], high=[inf], "
-        "target=[0, 0])",
-        lqr: "LQR(K=[[0.952]], period=0.1 s)",
-        adp.SafetyFilter(lambda x: -x[..., :1], plant, lambda x, t: 1 - x[..., 0], dt=0.02, decay=5.0): (
-            "SafetyFilter(around <lambda>, Pendulum(2 states, 1 input, damping=0.1), held for 0.02 s, "
-            "1 constraint, decay=[5] 1/s)"
-        ),
-    }
-    for thing, wanted in shown.items():
-        assert repr(thing) == wanted
-    policy = adp.near_optimal(plant, near, dt=0.05, reach="local")
-    first, *others = repr(policy).splitlines()
-    assert first == "NearOptimal(Pendulum, 2 states, 1 input, held for 0.05 s,"
-    assert len(others) == 4
