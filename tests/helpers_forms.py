@@ -188,17 +188,6 @@ def replaced(a: Tensor) -> list[Tensor]:
     return [*found, torch.nn.functional.one_hot(a.argmax(-1), 4), a.cumprod(0), a.nan_to_num(0.5)]
 
 
-def orders(a: Tensor) -> list[Tensor]:
-    """Of (B, 3, 4), along both dimensions, of equal numbers too."""
-    r, edges = (2 * a).round(), torch.tensor([[-1.0, 0.0, 0.0, 2.0]] * 3, dtype=a.dtype)
-    found = [f(dim) for dim in (1, -1) for f in (r.cumprod, a.argsort)]
-    found += [f(dim)[0] for dim in (1, -1) for f in (r.cummax, r.cummin, r.median, r.sort)]
-    found += [part for k in (1, 3) for part in (r.kthvalue(k, 1, True)[0], r.topk(k, 2, False)[0])]
-    found += [a.var(dims, correction=c) for dims in (1, (1, 2), None) for c in (0.0, 2.0)]
-    found += [torch.searchsorted(edges, r[0], right=right).unsqueeze(0) for right in (True, False)]
-    return [*found, a.topk(2, 1)[1], a.prod(1).prod(1), a[:, :1].median()]
-
-
 def large(a: Tensor) -> list[Tensor]:
     """Of (B, n): maps, sums and products that are loops from 65 entries on."""
     n = a.shape[-1]
@@ -255,18 +244,6 @@ def loops(a: Tensor, b: Tensor) -> list[Any]:
     unused = lanes.scan(lambda s, p: ((s[0] + p, s[1] * p), (s[0], s[1], p)), (b, b), a)[1][0]
     swapped = lanes.repeat(4, lambda z: (z[1], z[0]), (b, b.exp()))
     return [ends, kept, unrolled, constant, masked, unused, swapped]
-
-
-def more_choices(a: Tensor, k: Tensor) -> list[Tensor]:
-    """Of (B, 3, 4, 5) and (B, 2, 2, 2): an index that is smaller than the tensor in every dimension."""
-    return [
-        *(a.gather(dim, k) for dim in (1, 2, 3, -1, -2)),
-        *(a.scatter(dim, k, a[:, 1:, 1:, 2:]) for dim in (1, 2, 3, -1)),
-        *(a.scatter(dim, k, 0.5) for dim in (1, 3)),
-        *(a.scatter_add(dim, k, a[:, :2, :2, :2]) for dim in (1, 2, 3, -1)),
-        *(torch.take_along_dim(a[:, :2, :2, :2], k, dim) for dim in (1, 2, 3)), a[:, k[0, 0, 0]],
-        a[:, :, k[0, 0]], a.index_select(3, k[0, 1, 1]), torch.index_select(a, -1, k[0, 0, 0]).sin(),
-    ]
 
 
 def written(a: Tensor, k: Tensor) -> list[Tensor]:

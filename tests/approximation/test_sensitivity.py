@@ -50,15 +50,17 @@ def test_weight_jacobian_is_what_differences_of_the_dense_solution_give(kernel: 
         assert_close(row, central_differences(basis, basis.centers(at), 1e-3), 1e-6)
 
 
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script:DeprecationWarning")  # torch's own, in jacfwd
 @pytest.mark.parametrize(("kernel", "radius"), by_turns(KERNELS, list(RADII)))
 def test_state_jacobian_is_that_of_the_ideal_weights(kernel: str, radius: str) -> None:
     basis = basis_of(kernel, 3, RADII[radius][0]())
     x = uniform(3, 2, seed=5) + tensor([0.9, 0.2])
     found = state_jacobian(basis, x, smooth_target)
     assert found.shape == (3, 3, 2)
+    weights = lambda y: basis.ideal_weights(y, smooth_target)  # noqa: E731
     for row, at in zip(found, x, strict=True):
-        expected = torch.func.jacrev(lambda y: basis.ideal_weights(y, smooth_target))(at)
-        assert_close(row, expected, 1e-7)
+        assert_close(row, torch.func.jacrev(weights)(at), 1e-7)
+    assert_close(torch.vmap(torch.func.jacfwd(weights))(x), found, 1e-7)
 
 
 def test_state_jacobian_is_the_weight_jacobian_along_the_moving_centers() -> None:
