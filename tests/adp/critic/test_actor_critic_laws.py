@@ -161,7 +161,7 @@ def continuous(law: ActorCriticLaw, duration: float) -> tuple[Tensor, Weights, T
     y = torch.cat([part.flatten(1) for part in (x, *controller.init(x)[:3], x.new_zeros(1, 1))], dim=-1)
     time = 0.0
     while time < duration - 1e-12:
-        h = min(0.1, 1e-3 + 0.03 * time, duration - time)
+        h = min(0.1, 1e-3 + 0.05 * time, duration - time)
         y, time = runge_kutta_step(field, y, h), time + h
     return parts(y)
 

@@ -191,7 +191,7 @@ def test_a_loop_that_overflows_within_a_period_is_unstable_and_told(caplog: pyte
         assert adp.held_stability(lambda x, gain=gain: gain * x, each, 1.0).spectral_radius > 1
     assert adp.held_stability(lambda x: -1001 * x, plant, 1.0).spectral_radius == INF
     cost = adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1)
-    adp.simulate(lambda x: -1001 * x, plant, cost, tensor([[1.0]]), dt=1.0, steps=1)
+    adp.simulate(lambda x: -1.5e4 * x, stepped, cost, tensor([[1.0]]), dt=10.0, steps=1)
     assert "has the spectral radius inf" in caplog.text
 
 
