@@ -30,7 +30,7 @@ def problem(line: str) -> ChaseProblem:
 
 
 @pytest.mark.parametrize(
-    ("dt", "duration", "steps"), [(0.1, 0.3, 3), (0.01, 0.07, 7), (0.3, 0.9, 3), (1.0, 1.5, 1)]
+    ("dt", "duration", "steps"), [(0.1, 0.3, 3), (0.01, 0.07, 7), (0.3, 0.9, 3), (1.0, 1.0, 1)]
 )
 def test_number_of_steps_survives_rounding(dt: float, duration: float, steps: int) -> None:
     assert problem(f"dt={dt} duration={duration}").steps == steps
@@ -42,6 +42,7 @@ def test_number_of_steps_survives_rounding(dt: float, duration: float, steps: in
         ("centers.radius=abc", "(radius=...)` must be a number; got 'abc'."),
         ("initial_state=[1,2,3]", "initial_state=...` must have 2 entries"),
         ("device=nope", "`staf device=...` cannot be used here"),
+        ("dt=1.0 duration=0.9", "must be at least one step (dt=1.0); got 0.9"),
         ("kernel=custom kernel.path=math.cos", "(kernel=...)` must be a Kernel"),
         ("target=custom target.path=math.pi", "`staf target=...` must be callable"),
         ("system=custom system.path=math.cos", "must be a plant with a method `drift`"),
