@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -66,29 +65,21 @@ def staf(place: Path, *line: str) -> tuple[int, str]:
     return ended.returncode, ended.stdout + ended.stderr
 
 
-def test_a_sweep_on_two_nodes_ends_with_the_bits_of_one_that_is_not(cluster: str, place: Path) -> None:
-    ray = [
-        "hydra.launcher.executor=ray",
-        f"+hydra.launcher.ray.address='{cluster}'",
-        "hydra.launcher.batch=2",
-    ]
-    for name, more in (("inline", ["hydra.launcher.batch=2"]), ("two", ray)):
-        code, out = staf(place, *GRID, *more, f"hydra.sweep.dir={name}")
-        assert code == 0, out
-    one, two = (collect(place / name).rows for name in ("inline", "two"))
-    assert [run.metrics for run in one] == [run.metrics for run in two]
-    assert len(two) == 4
-
-
-def test_rows_of_a_table_have_the_same_bytes_from_two_nodes(cluster: str, place: Path) -> None:
+@pytest.mark.parametrize("records", ["directories", "table"])
+def test_a_sweep_on_two_nodes_ends_with_the_bits_of_one_that_is_not(
+    records: str, cluster: str, place: Path
+) -> None:
     ray = ["hydra.launcher.executor=ray", f"+hydra.launcher.ray.address='{cluster}'"]
-    for name, more in (("rows_inline", []), ("rows_two", ray)):
-        line = [*GRID, "sweep.records=table", "hydra.launcher.batch=2", *more]
-        code, out = staf(place, *line, f"hydra.sweep.dir={name}")
+    one, two = place / f"{records}_inline", place / f"{records}_two"
+    for folder, more in ((one, []), (two, ray)):
+        line = [*GRID, f"sweep.records={records}", "hydra.launcher.batch=2", f"hydra.sweep.dir={folder}"]
+        code, out = staf(place, *line, *more)
         assert code == 0, out
-    rows = (place / "rows_two" / "rows.json").read_bytes()
-    assert rows == (place / "rows_inline" / "rows.json").read_bytes()
-    assert len(json.loads(rows)["rows"]) == 4
+    if records == "table":
+        assert (two / "rows.json").read_bytes() == (one / "rows.json").read_bytes()
+    found, wanted = collect(two).rows, collect(one).rows
+    assert [run.metrics for run in found] == [run.metrics for run in wanted]
+    assert len(found) == 4
 
 
 def test_a_killed_worker_is_tried_once_more_and_fails_alone(cluster: str, place: Path) -> None:

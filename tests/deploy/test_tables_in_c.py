@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from variants import by_turns
 
 from staf_torch import (
@@ -155,39 +155,9 @@ def test_a_number_that_is_written_by_hand_is_that_of_an_export(
     assert changed.equal(wanted)
 
 
-class Own(nn.Module):
-    """A policy of a user's: a buffer, a slice of it, a captured table of more than a loop's entries."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.register_buffer("gain", torch.tensor([[1.5, -0.5]]).double())
-        self.register_buffer("mixed", torch.linspace(-1, 1, 90, dtype=torch.float64).reshape(45, 2))
-        self.limits = {"high": torch.tensor(0.7, dtype=torch.float64)}
-
-    def forward(self, x: Tensor) -> Tensor:
-        wide = (x @ self.mixed.T).tanh().sum(-1, keepdim=True)
-        return (x @ self.gain.T + wide).clamp(max=self.limits["high"])
-
-
-@needs_gcc
-def test_numbers_are_called_as_the_attributes_that_hold_them(tmp_path: Path) -> None:
-    policy, path, x = Own(), tmp_path / "own.h", around(20)
-    deploy.export_c(policy, x, path, ["u"], name="go")
-    text = path.read_text()
-    for said in (
-        r"1\.5, /\* \d+: gain\[0, 0\] \*/",
-        r"0\.7, /\* \d+: limits\[high\] \*/",
-        r"mixed\[44, 1\] \*/",
-    ):
-        assert re.search(said, text)
-    (u,) = runner_c(path, [1], torch.float64)(x)
-    torch.testing.assert_close(u, policy(x), rtol=1e-13, atol=1e-13)
-    assert "1.5" not in TABLE.sub("", text)
-
-
 def test_an_object_with_numbers_of_rows_is_refused_or_one_row_is_named(tmp_path: Path) -> None:
-    policy = Own()
-    policy.gain = rows(torch.ones(3, 1, 2).double())
+    policy = deploy.policy_of(adp.LQR(systems.TwoState(), COST))
+    policy.k = rows(torch.ones(3, 1, 2).double())
     with pytest.raises(ValueError, match=r"rows"):
         deploy.export_c(policy, around(1), tmp_path / "a.h", ["u"])
     assert not list(tmp_path.iterdir())
