@@ -170,7 +170,7 @@ def test_near_optimal_with_bounds_is_exported_with_its_plan_or_as_a_function_of_
         "adp.policy.horizon=0.2",
         "system=pendulum",
     ]
-    size = ["+adp.cost.low=-3", "+adp.cost.high=3", "initial_state=[0.02,0.0]", "dt=0.05", "duration=0.2"]
+    size = ["+adp.cost.low=-3", "+adp.cost.high=3", "initial_state=[0.02,0.0]", "dt=0.05", "duration=0.1"]
     cfg, run = settings("experiment=adp", "figures=false", *chosen, *size), tmp_path / "class"
     (run / ".hydra").mkdir(parents=True)
     OmegaConf.save(cfg, run / ".hydra" / "config.yaml")

@@ -46,9 +46,7 @@ def walled(policy: Any) -> adp.SafetyFilter:
 
 
 POLICIES: dict[str, Callable[[], Any]] = {
-    "a filter around near_optimal": lambda: walled(
-        adp.near_optimal(LINE, COST, dt=0.1, low=-1.0, high=1.0, horizon=0.4, reach="local")
-    ),
+    "a filter": lambda: walled(LQR),
     "a memory": remembered,
 }
 TAKEN = "class", "restrict", "sinf", "state", "a__b", "9", "own_near"
@@ -118,7 +116,7 @@ def test_two_controllers_in_one_program_give_each_its_own_controls(tmp_path: Pat
 @needs_onnx
 @pytest.mark.parametrize(
     ("name", "dtype", "batch"),
-    [("a filter around near_optimal", torch.float64, None), ("a memory", torch.float32, 1)],
+    [("a filter", torch.float64, None), ("a memory", torch.float32, 1)],
 )
 def test_loops_of_a_policy_are_loops_in_onnx(
     name: str, dtype: torch.dtype, batch: int | None, tmp_path: Path

@@ -57,9 +57,6 @@ def rollout(mass: float) -> adp.RolloutPolicy:
 POLICIES: dict[str, Callable[[bool], Any]] = {
     "gains of an LQR": lambda b: adp.LQR(systems.TwoState(), adp.QuadraticCost(9.0 if b else 1.0, 1.0, 2, 1)),
     "a kernel's width, weights": lambda b: learner(1.3 if b else 0.8),
-    "a radius and what follows in rollouts": lambda b: adp.RolloutPolicy.of_lqr(
-        systems.TwoState(), COST, steps=2, radius=0.2 if b else 0.1
-    ),
 }
 
 

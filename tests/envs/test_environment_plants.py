@@ -21,7 +21,7 @@ def test_environment_that_can_be_set_to_a_state_is_the_same_plant_as_its_port() 
     assert (real.period, real.periodic, real.traceable) == (0.05, (0,), False)
     torch.testing.assert_close(adp.LQR(real, cost).k, adp.LQR(ported, cost).k, rtol=1e-6, atol=0)
     x0 = torch.tensor([[0.2, 0.1], [-0.3, 0.0]], dtype=torch.float64)
-    runs = [adp.simulate(adp.LQR(ported, cost), p, cost, x0, steps=20, compile=False) for p in (ported, real)]
+    runs = [adp.simulate(adp.LQR(ported, cost), p, cost, x0, steps=8, compile=False) for p in (ported, real)]
     torch.testing.assert_close(runs[0].cost, runs[1].cost, rtol=1e-12, atol=0)
 
 

@@ -34,8 +34,8 @@ RECORD = {
     "settings": {"seed": 7, "kernel": "gaussian"},
     "seconds": 0.5,
 }
-CASES = int(os.environ.get("STAF_FUZZ", "15"))
-fuzz = settings(max_examples=CASES, deadline=None, derandomize=CASES == 15)
+CASES = int(os.environ.get("STAF_FUZZ", "10"))
+fuzz = settings(max_examples=CASES, deadline=None, derandomize=CASES == 10)
 ANY = st.lists(st.integers(0, 0x10FFFF).map(chr), max_size=20).map("".join)
 TEXT = ANY | st.sampled_from(["completed", "ball_error", "=1", "\x1b[31m", "\ud800", "a|b", "${a}"])
 NUMBER = st.floats() | st.integers() | st.integers(min_value=-(10**40), max_value=10**40)
