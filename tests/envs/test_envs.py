@@ -141,7 +141,7 @@ def test_rows_of_an_agent_draw_from_their_own_seeds() -> None:
         assert torch.equal(uniform, wanted)
 
 
-@pytest.mark.parametrize(("horizon", "steps"), [(0.3, 3), (0.25, 3), (0.1 * (3 + 1.5e-9), 4)])
+@pytest.mark.parametrize(("horizon", "steps"), [(0.6 + 2e-16, 6), (0.25, 3), (0.1 * (3 + 1.5e-9), 4)])
 def test_an_episode_is_truncated_at_its_horizon_and_not_before(horizon: float, steps: int) -> None:
     plant, cost = systems.TwoState(), adp.QuadraticCost(1.0, 1.0, 2, 1)
     episodes = envs.Episodes(plant, cost, 2, dt=0.1, horizon=horizon, limit=9.0, penalty=7.0)
