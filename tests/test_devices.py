@@ -199,7 +199,8 @@ def moving(x: Tensor, name: str, steps: int = 4) -> Any:
     start = x.new_full((3, plant.equilibrium().numel()), 0.1)
     cost = adp.QuadraticCost(1.0, 1.0, start.shape[1], plant.inputs).to(x.device)
     loop = adp.simulate(lambda x: -x[..., : plant.inputs], plant, cost, start, dt=0.01, steps=steps, every=2)
-    return systems.simulate(plant, start, dt=0.01, steps=steps), loop
+    here = systems.simulate(PLANTS[name](), start, dt=0.01, steps=steps)  # of a plant that was not moved
+    return systems.simulate(plant, start, dt=0.01, steps=steps), here, loop
 
 
 def paid(x: Tensor, name: str) -> Tensor:
