@@ -237,28 +237,3 @@ def test_every_way_of_a_chase_finds_the_same(name: str, law: str) -> None:
         assert torch.equal(alone.diverged_at, whole.diverged_at)
     last = chase_weights(spoilt.split([2, 5], 1), *given, **options, history=False)
     torch.testing.assert_close(last.weights, whole.weights[:, -1:], rtol=1e-8, atol=1e-10)
-
-
-def test_a_reach_beyond_one_is_warned_of_once_in_however_many_pieces() -> None:
-    """Also where the first piece has none, and by a state that is not the last."""
-    basis = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(st.rings(3), 0.5))
-    states = 0.5 * circles(2, 12)
-    states[1, 5] *= 6.0  # |x| r = 1.2 or so
-    states[0, 9] *= 9.0
-    worst = [float(0.5 * states[:, at].norm(dim=-1).max()) for at in (slice(4, 8), slice(8, 12))]
-    with pytest.warns(UserWarning, match=f"r = {worst[0]:.3g} > 1.*Shrink the radius") as seen:
-        chase_weights(states.split(4, dim=1), basis, Paper(), LAW)
-    assert len(seen) == 1
-    assert worst[1] > 1
-    chase(0.4 * states[:1, :4], basis, Paper(), LAW)  # nothing to say
-
-
-def test_zero_weights_are_zero_also_where_their_unit_overflows() -> None:
-    far = tensor([[[60.0, 0.0], [60.0, 0.01]]])
-    basis = st.StaFBasis(st.ExponentialKernel(), st.StateFollowingCenters(st.rings(3), 1e-3))
-    one = chase(far, basis, Paper(), LAW, weights=torch.zeros(3))
-    other = chase(far, basis, Paper(), LAW)
-    assert torch.equal(one.coefficients, other.coefficients)
-    assert one.coefficients.isfinite().all()
-    some = chase(far, basis, Paper(), LAW, weights=tensor([0.0, 1.0, 0.0]), inner_steps=0)
-    assert some.diverged_at.tolist() == [0]

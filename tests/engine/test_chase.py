@@ -97,17 +97,6 @@ def test_a_row_is_as_it_would_be_alone_and_one_that_is_not_finite_freezes_alone(
             assert torch.isnan(found[key][row, first:]).all(), key
 
 
-def test_a_target_that_is_not_finite_somewhere_freezes_only_the_row_that_goes_there() -> None:
-    states = orbit((1.0, 0.0), (0.4, 0.0), dt=0.4, steps=8)
-
-    def hole(x: torch.Tensor) -> torch.Tensor:
-        return (x[..., 0] + 0.9).sqrt()  # NaN for x1 < -0.9
-
-    result = st.chase(states, basis_of("gaussian", 3, 0.1), hole, SteepestDescent())
-    assert result.diverged.tolist() == [True, False]
-    assert torch.isfinite(result.estimate[1]).all()
-
-
 @over(["gaussian", "polynomial", "user_defined"])
 def test_a_chase_can_be_differentiated(name: str) -> None:
     basis, law = basis_of(name, count=3), SteepestDescent()

@@ -135,13 +135,6 @@ def test_a_header_starts_with_the_first_row_and_has_the_names_of_its_trees() -> 
     assert "double a[2], double b[2])" in named
 
 
-@pytest.mark.parametrize("name", ["9x", "state", "double"])
-def test_a_name_that_c_does_not_take_is_refused(name: str) -> None:
-    program = lanes.Program(lambda x, _, __: (x, x))
-    with pytest.raises(ValueError, match=rf"`c_source\(outputs=...\)` must .*; got '{name}'"):
-        program.c_source("f", torch.ones(1), outputs=[name])
-
-
 VERSION = ".".join(torch.__version__.split(".")[:2])
 TEXTS: dict[str, Callable[[], str]] = {
     "C of a step": lambda: lanes.Program(moved).c_source(

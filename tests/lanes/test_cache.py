@@ -9,7 +9,6 @@ import os
 import platform
 import re
 import shutil
-import signal
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -223,24 +222,6 @@ def test_nothing_is_loaded_that_somebody_else_may_have_written(
     assert re.match(rf"{path} is not used, as machine code is run from there: {reason}", line)
 
 
-def test_what_a_killed_process_left_is_swept_and_what_one_builds_now_is_not(cache: Path) -> None:
-    folder = folder_of.cache()
-
-    def killed() -> None:
-        with folder_of.scratch(folder):
-            os.kill(os.getpid(), signal.SIGKILL)
-
-    child = multiprocessing.get_context("fork").Process(target=killed)
-    child.start()
-    child.join(60)
-    (left,) = folder.iterdir()
-    with folder_of.scratch(folder) as ours:
-        folder_of.prune(folder)  # too young: it may be about to be locked
-        folder_of.prune(folder, now=time.time() + 5)
-        assert list(folder.iterdir()) == [ours]
-        assert left != ours
-
-
 def test_a_home_that_cannot_be_written_is_replaced_by_a_folder_of_the_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -254,12 +235,6 @@ def test_a_home_that_cannot_be_written_is_replaced_by_a_folder_of_the_process(
     assert len(set(folder.iterdir()) - before) == 1
     shutil.rmtree(folder)  # somebody tidies up
     assert folder_of.cache().is_dir()
-
-
-def test_the_cache_is_where_the_user_has_his_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
-    monkeypatch.setenv("HOME", str(tmp_path))
-    assert folder_of.cache() == tmp_path / ".cache" / "staf_torch"
 
 
 def test_checkouts_of_one_version_share_a_library_and_others_do_not(

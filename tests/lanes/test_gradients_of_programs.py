@@ -126,14 +126,6 @@ def test_numbers_that_are_learned_are_read_anew_and_nothing_is_traced_again() ->
         late.backward()
 
 
-def test_where_nobody_asks_for_it_there_is_none() -> None:
-    given = inputs()
-    with torch.no_grad():
-        assert not EVERYTHING(*given)[0][0].requires_grad
-    with torch.inference_mode():
-        assert not EVERYTHING(*given)[0][0].requires_grad
-
-
 def _doubled(result: Tensor) -> None:
     result.mul_(2)
 

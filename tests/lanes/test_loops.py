@@ -61,20 +61,6 @@ def test_passes_a_row_are_those_of_the_row_alone(rows: int) -> None:
         assert torch.equal(GROWING(x[4:5], u[4:5])[1][0], value[4:5])
 
 
-def test_nothing_is_computed_once_no_row_goes_on() -> None:
-    asked = list[int]()
-
-    def double(x: Tensor) -> Tensor:
-        asked.append(1)
-        return 2 * x
-
-    found = lanes.repeat(9, double, torch.tensor([1.0, 3.0, 70.0]), where=lambda x: x < 50)
-    assert found.tolist() == [64.0, 96.0, 70.0]
-    assert len(asked) == 6
-    lanes.repeat(9, double, torch.tensor([60.0]), where=lambda x: x < 50)
-    assert len(asked) == 6
-
-
 def test_a_branch_of_some_rows_is_called_with_these_alone_also_compiled() -> None:
     x, seen = torch.linspace(-1, 1, 10, dtype=torch.float64).view(5, 2), list[int]()
 

@@ -3,9 +3,7 @@ served by what was compiled of it."""
 
 from __future__ import annotations
 
-import copy
 import math
-import pickle
 import sys
 import threading
 from collections.abc import Callable
@@ -257,13 +255,6 @@ def test_closures_of_equal_content_share_a_program_and_others_do_not(notebook: A
         right(of(kept, notebook.closing(by)), lambda x, by=by: x * by)
 
 
-def test_a_function_that_an_editor_reloads_in_place_is_another(notebook: Any) -> None:
-    kept = SharedPrograms("a test")
-    right(of(kept, notebook.outer), notebook.outer)
-    notebook.inner.__code__ = (lambda x: 7 * x).__code__
-    right(of(kept, notebook.outer), lambda x: 7 * x)
-
-
 class Held(nn.Module):
     """Of a user: it computes with numbers of every kind, some of them inside of others."""
 
@@ -403,19 +394,6 @@ def test_a_policy_is_ready_before_its_loop_begins_or_says_that_it_cannot_be(
     assert ready(nn.Sequential(policy, module), X[0])  # none of its other methods is asked
     assert not ready(nn.Sequential(policy, Noisy()), X[0])
     assert "draws random numbers" in caplog.text
-
-
-@pytest.mark.parametrize(
-    "copied", [copy.copy, copy.deepcopy, lambda policy: pickle.loads(pickle.dumps(policy))]
-)
-def test_a_copy_of_a_policy_compiles_programs_of_its_own(copied: Callable[[nn.Module], Policy]) -> None:
-    policy = Policy()
-    assert ready(policy, X)
-    other = copied(policy)
-    assert not other.forward.compiled
-    other.scale = 3.0
-    assert ready(other, X)
-    torch.testing.assert_close(other(X), 3 * policy(X), rtol=1e-13, atol=1e-13)
 
 
 def test_what_cannot_be_watched_is_said_once_and_taken_as_it_stands(caplog: pytest.LogCaptureFixture) -> None:

@@ -96,28 +96,6 @@ def test_threads_do_not_change_bits() -> None:
         torch.set_num_threads(threads)
 
 
-def test_few_rows_in_plain_torch_take_one_thread_and_the_users_number_stays() -> None:
-    seen, threads = list[int](), torch.get_num_threads()
-
-    def step(x: Tensor, *_: object) -> tuple[Tensor, Tensor]:
-        seen.append(torch.get_num_threads())
-        if len(x) == 3:
-            raise ArithmeticError
-        return x + 1, x
-
-    program = lanes.Program(step, compile=False)
-    try:
-        torch.set_num_threads(2)
-        for rows in (20, 1000):
-            program(torch.zeros(rows), steps=1)
-        assert seen == [1, 2]
-        with pytest.raises(ArithmeticError):
-            program(torch.zeros(3), steps=1)
-        assert torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(threads)
-
-
 def test_a_prepared_call_is_the_program_for_all_inputs() -> None:
     x, u, (gain, mass) = inputs(5)
     prepared = PENDULUM.prepare(x, u, (gain, mass))

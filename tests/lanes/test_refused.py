@@ -130,12 +130,6 @@ def test_what_a_step_reads_now_is_asked_anew_of_a_single_row_too() -> None:
     assert len({float(program(none, none, x)[1][0, 0, 0]) for _ in range(5)}) == 5
 
 
-def test_a_header_of_a_noisy_function_is_refused() -> None:
-    program = Program(lambda carry, now, row: (carry, (Noisy()(row["x"]),)), name="the header")
-    with pytest.raises(NotLoweredError, match="called again"):
-        program.c_source("noisy", row={"x": X[:1]})
-
-
 @pytest.mark.parametrize("mixed", [False, True])
 def test_what_rounding_decides_says_nothing_of_a_row(mixed: bool) -> None:
     def step(x: Tensor, now: object, row: object) -> tuple[Tensor, tuple[Tensor, Tensor]]:

@@ -2,45 +2,11 @@
 
 from __future__ import annotations
 
-import io
-import logging
 import subprocess
 import sys
-import time
 from pathlib import Path
 
-import pytest
 from command_line import environment
-
-from staf_torch.signs import Sign
-
-
-class Terminal(io.StringIO):
-    """Where bars are shown."""
-
-    def isatty(self) -> bool:
-        return True
-
-
-def test_a_terminal_has_a_bar_under_the_log_that_is_wiped_in_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    shown = Terminal()
-    monkeypatch.setattr(sys, "stderr", shown)
-    handler = logging.StreamHandler(shown)
-    logging.getLogger().addHandler(handler)
-    try:
-        with Sign("a sum", 8, "parts") as sign:
-            sign.advance()
-            sign.advance()
-            while "a sum" not in shown.getvalue():
-                time.sleep(0.05)
-            logging.getLogger("elsewhere").warning("above")
-            time.sleep(0.4)
-    finally:
-        logging.getLogger().removeHandler(handler)
-    found = shown.getvalue()
-    assert found.startswith("\r 25 %|######                  | a sum: 25 % of 8 parts, ")
-    assert "\r\x1b[Kabove\n\r 25 %|" in found
-    assert found.endswith("\r\x1b[K")
 
 
 def test_a_script_sees_what_is_going_on_and_how_far_it_is_and_not_the_calls_of_its_workers(

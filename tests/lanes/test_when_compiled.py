@@ -6,7 +6,6 @@ import itertools
 import re
 import time
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -53,10 +52,6 @@ def test_a_loop_is_compiled_where_its_operations_take_longer_than_a_compiler(
     assert torch.equal(found.state, run(Chain(links), steps, compile=compiled)[0].state)  # from the start
 
 
-class Enough(Exception):  # noqa: N818
-    """A test has seen what it was to see."""
-
-
 class Swing(systems.Pendulum):
     """A plant of a kind of its own: short calls are counted by kind."""
 
@@ -87,24 +82,3 @@ def test_short_calls_that_are_asked_again_and_again_say_once_what_they_cost(
     (line,) = [text for text in caplog.messages if "plain torch" in text]
     assert re.match(rf"{name}: 8 calls took 3.\d s in plain torch, 4\d\d ms each: each is too short", line)
     assert ("`compile=True` or `with lanes" in line) is (name == "the closed loop")
-
-
-def test_a_slow_plant_that_is_no_torch_says_within_two_seconds_how_long_it_takes(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    calls = 0
-
-    def step(x: object, u: object) -> object:
-        nonlocal calls
-        calls += 1
-        if caplog.messages:
-            raise Enough
-        time.sleep(0.3 if calls > 8 else 0.0)
-        return 0.9 * np.asarray(x) + 0.1 * np.asarray(u)
-
-    plant = systems.StepPlant(step, dim=2, inputs=1, dt=0.01)
-    with pytest.raises(Enough):
-        adp.simulate(lambda x: -x[..., 1:], plant, COST, X0, steps=1000)
-    (line,) = caplog.messages
-    assert "1000 steps took" in line
-    assert "a plant that is no torch is called at every step" in line

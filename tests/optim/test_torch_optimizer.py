@@ -48,23 +48,6 @@ def test_a_step_is_the_step_of_the_law_on_the_staf_quadratic(name: str, summed: 
         torch.testing.assert_close(parameter.detach(), weights, rtol=1e-7, atol=1e-9)
 
 
-def test_it_works_beside_adam_on_the_other_parameters() -> None:
-    objective = quadratic()
-    mine = nn.Parameter(torch.zeros(5, 4, dtype=torch.float64))
-    other = nn.Parameter(torch.ones(3, dtype=torch.float64))
-    adam = torch.optim.Adam([other], lr=0.1)
-    chaser = optim.ChaseOptimizer([mine], optim.ConjugateGradient(), inner_steps=4)
-    for _ in range(3):
-        adam.zero_grad()
-        chaser.zero_grad()
-        chaser.step(lambda: losses(objective, mine).sum() + other.square().sum())
-        assert other.grad is None
-        other.square().sum().backward()
-        adam.step()
-    torch.testing.assert_close(mine.detach(), objective.minimiser())
-    assert bool((other < 1).all())
-
-
 @pytest.mark.parametrize("name", ["recursive least squares", "barzilai-borwein"])
 def test_a_run_goes_on_from_its_state_dict(name: str) -> None:
     objective = quadratic()
