@@ -65,6 +65,14 @@ def test_gradient_and_control_solve_the_hjb_equation() -> None:
     assert (best.value < run.cost * (1 + 1e-4)).all()
 
 
+def test_row_that_fails_on_the_coarse_mesh_starts_again_on_the_fine_one() -> None:
+    x = uniform(6, 2.0)[:1]
+    best = adp.DirectShooting(PLANT, COST, intervals=32, iterations=10, starts=1).solve(x)
+    assert torch.isinf(best.mesh_error).all()  # nothing to compare with
+    assert best.converged.all()
+    assert (best.value / PLANT.optimal_value(x, COST.q, COST.r) - 1).abs().max() < 1e-4
+
+
 def test_too_few_iterations_are_reported_and_not_passed_off_as_an_optimum() -> None:
     best = adp.DirectShooting(PLANT, COST, intervals=8, iterations=1).solve(uniform(2, 2.0))
     assert not best.converged.any()
