@@ -12,7 +12,7 @@ import torch
 from helpers_swingup import double_integrator, pendulum
 from torch import Tensor
 
-from staf_torch import adp, deploy, systems
+from staf_torch import adp, deploy
 from staf_torch.adp.planning.trajectories import Trajectories
 from staf_torch.deploy.c_header import runner_c, runner_learning_c
 
@@ -53,30 +53,22 @@ def states(count: int) -> Tensor:
 
 
 @needs_cc
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_memory_in_c_has_the_control_of_the_library_and_says_what_a_call_takes(
-    memory: adp.GlobalValue, tmp_path: Path
+    dtype: torch.dtype, memory: adp.GlobalValue, tmp_path: Path
 ) -> None:
-    x, path = states(80), tmp_path / "memory.h"
-    policy = deploy.policy_of(memory)
-    source = deploy.export_c(policy, x, path, ["u"])
-    (u,) = runner_c(path, [1], torch.float64)(x)
-    torch.testing.assert_close(u, memory(x), rtol=0, atol=1e-12)
-    torch.testing.assert_close(policy(x), memory(x), rtol=0, atol=1e-12)
+    x, path = states(80).to(dtype), tmp_path / "memory.h"
+    source = deploy.export_c(deploy.policy_of(memory, dtype=dtype), x, path, ["u"])
+    (u,) = runner_c(path, [1], dtype)(x)
+    away = (u.double() - memory(x.double())).abs()
+    assert float(away.max()) < 1e-12 if dtype == torch.float64 else float(away.median()) < 1e-4
+    assert ("rintf(" in path.read_text()) == (dtype == torch.float32)
     assert 0.1 < float((u.abs() < 2).double().mean()) < 1  # not a bound everywhere
     said = f"compares {2 * len(memory.entries)} states and takes at most {source.flops} additions"
     assert said in path.read_text()
     timed = deploy.time_c(path, x, [1])
     assert timed.calls == 80
     assert 0 < timed.median_us <= timed.p99_us <= timed.worst_us
-
-
-@needs_cc
-def test_memory_in_float_chooses_nearly_the_same_control(memory: adp.GlobalValue, tmp_path: Path) -> None:
-    x, path = states(80).float(), tmp_path / "memory.h"
-    deploy.export_c(deploy.policy_of(memory, dtype=torch.float32), x, path, ["u"])
-    (u,) = runner_c(path, [1], torch.float32)(x)
-    assert float((u.double() - memory(x.double())).abs().median()) < 1e-4
-    assert "rintf(" in path.read_text()
 
 
 @needs_cc
@@ -106,31 +98,9 @@ def test_plan_that_is_carried_is_a_structure_in_c(kind: str, dtype: torch.dtype,
         deploy.policy_of(controller)
 
 
-@needs_cc
-@pytest.mark.parametrize(("kind", "dtype"), [("energy", torch.float64), ("near_optimal", torch.float32)])
-def test_feedback_of_a_plant_with_bounds_in_c(kind: str, dtype: torch.dtype, tmp_path: Path) -> None:
-    plant, cost = systems.Pendulum(), adp.QuadraticCost(1.0, 1.0, 2, 1, low=-3.0, high=3.0)
-    policy = (
-        adp.EnergyShaping(
-            plant, cost, lambda x: 0.5 * x[..., 1] ** 2 + 9.81 * x[..., 0].cos(), gain=0.1, capture=1.0
-        )
-        if kind == "energy"
-        else adp.near_optimal(plant, cost, dt=0.05, horizon=0.2, reach="local")
-    )
-    x, path = 0.2 * states(30), tmp_path / "policy.h"
-    deploy.export_c(deploy.policy_of(policy, dtype=dtype), x.to(dtype), path, ["u"])
-    (u,) = runner_c(path, [1], dtype)(x.to(dtype))
-    torch.testing.assert_close(u, policy(x).to(dtype), rtol=0, atol=1e-9 if dtype == torch.float64 else 1e-3)
-    assert bool((u.abs() < 3).any())
-
-
 def test_what_searches_on_the_way_is_refused_with_its_reason(memory: adp.GlobalValue, tmp_path: Path) -> None:
     mpc = adp.RecedingHorizon(memory.problem, steps=5, memory=memory, compile=False)
-    x = torch.zeros(1, 2, dtype=torch.float64)
-    for write in (
-        lambda: deploy.policy_of(mpc),
-        lambda: deploy.export_learning_c(mpc, x, tmp_path / "a.h", dt=0.1),
-    ):
-        with pytest.raises(ValueError, match="must not search a memory and then optimise"):
-            write()
-    assert not list(tmp_path.iterdir())
+    with pytest.raises(ValueError, match="must not search a memory and then optimise"):
+        deploy.policy_of(mpc)
+    with pytest.raises(ValueError, match="must not search a memory and then optimise"):
+        deploy.export_learning_c(mpc, states(1), tmp_path / "a.h", dt=0.1)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -84,20 +83,6 @@ def test_trust_builds_what_the_settings_name(arena: Arena) -> None:
     assert (arena.victim / "PWNED").exists()
 
 
-@pytest.mark.parametrize("kind", ["pipe", "link", "text"])
-def test_a_history_that_is_no_archive_is_refused_and_not_waited_for(kind: str, arena: Arena) -> None:
-    history = arena.one / "history.npz"
-    history.rename(arena.cwd / "elsewhere.npz")
-    if kind == "pipe":
-        os.mkfifo(history)
-    elif kind == "link":
-        history.symlink_to(arena.cwd / "elsewhere.npz")
-    else:
-        history.write_bytes(b"PK\x05\x06")
-    with pytest.raises(ValueError, match="history"):
-        deployable(arena.one)
-
-
 CELLS = {  # texts of settings that must arrive as texts in every format
     "formula": "=cmd|' /C calc'!A0",
     "plus": "+1+cmd",
@@ -135,36 +120,6 @@ def test_texts_arrive_as_texts_in_every_format(name: str, tmp_path: Path) -> Non
     # Behind an odd number of backslashes nothing is a tag, a link or an image, in a code span or not.
     assert re.findall(r"(?<!\\)(?:\\\\)*(?:<|\]\(|\]:|\]\[)", text) == [], text
     assert len({line.replace(r"\|", "").count("|") for line in text.splitlines() if line[:1] == "|"}) == 1
-
-
-def test_the_command_writes_a_table_through_no_link(tmp_path: Path) -> None:
-    write_run(tmp_path / "0", {"seed": 1}, {"ball_error": 0.125})
-    victim = tmp_path / "victim"
-    victim.write_text("mine")
-    (tmp_path / ".table.md.partial").symlink_to(victim)
-    (tmp_path / "table.md").symlink_to(victim)
-    assert main([str(tmp_path), "--output", str(tmp_path / "table.md")]) == 0
-    assert victim.read_text() == "mine"
-    assert "0.125" in (tmp_path / "table.md").read_text()
-
-
-def test_no_name_of_a_folder_reaches_the_terminal_as_it_is(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for number, name in enumerate(("0", "\x1b[2J\u202e", "\x1b]0;x\x07")):
-        write_run(tmp_path / name, {"seed": number}, {"ball_error": 0.1 * number}, version=f"0.0.{number}")
-    (tmp_path / "\x1b]0;x\x07" / "run.json").write_text("{")
-    for line in ([], ["--format", "csv"]):
-        assert main([str(tmp_path), *line]) == 0
-        said = "".join(capsys.readouterr())
-        assert not set(said) & {"\x1b", "\x07", "\u202e"}
-
-
-def test_no_space_hides_a_formula_from_the_table_and_none_is_computed(tmp_path: Path) -> None:
-    for number, value in enumerate((" =1+1", "\uff1d1+1", "\t@x", "plain")):
-        write_run(tmp_path / str(number), {"kernel": value}, {"ball_error": 0.1})
-    rows = csv.DictReader(io.StringIO(tabulate(collect(tmp_path)).csv()))
-    assert [row["kernel"][0] for row in rows] == ["'", "'", "'", "p"]
 
 
 def test_a_number_in_a_list_that_is_none_costs_no_table(tmp_path: Path) -> None:

@@ -12,13 +12,13 @@ import pytest
 from staf_torch.results.files import (
     UnreadableError,
     all_visible,
-    links_in,
     open_regular,
     parse_object,
     read_bytes,
     read_lines,
     read_object,
 )
+from staf_torch.results.run_directory import History
 from staf_torch.settings import config_directory
 from staf_torch.settings.trust import constructors, foreign_settings, refusal
 
@@ -100,7 +100,7 @@ def test_what_is_no_regular_file_is_refused_in_a_sentence_and_not_waited_for(tmp
         (tmp_path, f"{tmp_path.name} is not a regular file"),
         (tmp_path / "a\0b", "cannot be read: embedded null byte"),
     ):
-        for read in (open_regular, read_bytes, read_object):
+        for read in (open_regular, read_bytes, read_object, History):
             with pytest.raises(UnreadableError, match=why):
                 read(path)
     assert read_bytes(tmp_path / "file") == b"own\nlines"
@@ -146,21 +146,3 @@ def test_texts_of_a_record_are_harmless_on_a_terminal(written: str, read: Any) -
     assert all_visible({"a\r": ["\r", 1, None, {2: "\r"}]}) == {
         "a\\u000d": ["\\u000d", 1, None, {"2": "\\u000d"}]
     }
-
-
-def test_links_of_every_kind_are_found_and_files_and_folders_are_none(tmp_path: Path) -> None:
-    outside, inside = tmp_path / "outside", tmp_path / "run" / "deep"
-    outside.mkdir()
-    inside.mkdir(parents=True)
-    (outside / "own.txt").write_text("own")
-    (inside / "metrics.json").write_text("{}")
-    (inside / "empty").mkdir()
-    assert links_in(tmp_path / "run") == []
-    (inside / "to a file").symlink_to(outside / "own.txt")
-    (inside / "to a folder").symlink_to(outside)
-    (inside / "to nothing").symlink_to(tmp_path / "nothing")
-    (inside / "hard").hardlink_to(outside / "own.txt")
-    os.mkfifo(inside / "pipe")
-    found = {path.name for path in links_in(tmp_path / "run")}
-    assert found == {"to a file", "to a folder", "to nothing", "hard", "pipe"}
-    assert links_in(tmp_path / "nothing") == []

@@ -55,24 +55,6 @@ def test_workers_end_with_their_parent_however_it_ends(number: signal.Signals, t
     assert gone(workers)
 
 
-@pytest.mark.parametrize("reused", [False, True])
-def test_a_process_ends_with_another_and_with_one_whose_number_is_used_again(reused: bool) -> None:
-    program = "import sys, time; from staf_torch.sweeps.workers import beginning, end_with;"
-    program += "print('watching', flush=True); pid = int(sys.argv[1]);"
-    program += f"end_with(pid, {'an earlier time' if reused else None!r} or beginning(pid)); time.sleep(600)"
-    with subprocess.Popen(["sleep", "600"]) as watched:
-        line = [sys.executable, "-c", program, str(watched.pid)]
-        with subprocess.Popen(line, env=environment(), stdout=subprocess.PIPE, text=True) as other:
-            assert other.stdout is not None
-            assert other.stdout.readline() == "watching\n"
-            if not reused:
-                assert other.poll() is None
-                watched.kill()
-                watched.wait()
-            assert other.wait(60) == 1
-        watched.kill()
-
-
 def lives(pid: int) -> bool:
     """Whether a process goes on; one that has ended and nobody waited for does not."""
     try:
