@@ -90,18 +90,15 @@ def test_pole_on_a_cart_rests_in_spite_of_a_leaning_gravity_and_is_held_for_its_
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("model", "message"),
     [
-        ({"model": "nowhere.xml"}, r"`MujocoPlant\(model=...\)` cannot be read \(.*nowhere.xml"),
-        ({"model": 3}, r"must be the path of an XML file, XML text or an MjModel; got 3"),
-        ({"dt": 0.025}, r"`MujocoPlant\(dt=...\)` must be a multiple of the model's timestep of 0.01 s"),
-        ({"model": "<mujoco/>"}, r"must have an actuator; got 'none'"),
-        ({"model": FLOATING}, r"must have hinges and slides alone.*mjJNT_FREE"),
+        ("nowhere.xml", r"`MujocoPlant\(model=...\)` cannot be read \(.*nowhere.xml"),
+        (FLOATING, r"must have hinges and slides alone.*mjJNT_FREE"),
     ],
 )
-def test_models_that_are_no_plant_are_refused(given: dict[str, object], message: str) -> None:
+def test_models_that_are_no_plant_are_refused(model: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        systems.MujocoPlant(**({"model": POLE.format(integrator="Euler")} | given))
+        systems.MujocoPlant(model)
 
 
 SOLVED = {
