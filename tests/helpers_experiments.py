@@ -24,7 +24,6 @@ CASES: dict[str, str] = {
     "adp_initial_weights": "experiment=adp_initial_weights duration=0.3 dt=0.02 trajectories=5 "
     "initial_weights=[0.1,1.0]",
     "adp_tracking": "experiment=adp_tracking duration=0.3 dt=0.01",
-    "avoidance": "experiment=avoidance trajectories=3 duration=2.0 dt=0.2 adp.compile=false",
     "avoidance of a unicycle": "experiment=avoidance avoidance.vehicle=unicycle avoidance.discs=2 "
     "trajectories=3 duration=3.0 dt=0.2 adp.compile=false",
     "exponential_bound": "experiment=exponential_bound exponential_bound.states=9 "

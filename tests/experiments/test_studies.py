@@ -39,8 +39,6 @@ def test_a_study_has_a_row_metrics_and_a_line_a_method(
         "other_c": 2.0,
     }
     assert caplog.messages[0] == "mine: a b 1.2346"
-    assert (tmp_path / "both.csv").read_text().splitlines()[0] == "method,a_b,c,time"
-    assert "1.2346" in (tmp_path / "both.md").read_text()
     assert {path.name for path in tmp_path.iterdir()} == {"both.csv", "both.md", "metrics.json"}
 
 
@@ -52,6 +50,11 @@ RATES: dict[str, Callable[[np.ndarray, np.ndarray, np.ndarray], list[float]]] = 
     ],
     "unstable": lambda x, u, t: [x[1], 25 * x[0] + t[0] * u[0] + t[1] * u[1] / 10],
     "mass": lambda x, u, t: [x[1], 9.81 * math.sin(x[0]) + t[0] * (u[0] - 0.1 * x[1])],
+}
+AFTER = {
+    "short_period": [-1.175, 0.9871, -8.458, -0.8776, 0.7, 0.0],
+    "unstable": [0.5, 1.0],
+    "mass": [2.0],  # 1 / mass
 }
 
 
@@ -68,22 +71,17 @@ def test_a_plant_with_a_fault_moves_as_its_text_says_and_is_drawn_by_the_seed_al
     assert [len(part) for part in (case.x0, case.before, case.after, case.at)] == [4] * 4
     assert torch.equal(case.x0, made(4).x0)
     assert torch.equal(case.at, made(4).at)
+    assert case.after[0].tolist() == AFTER[name]
 
 
-def test_the_faults_are_those_of_the_text() -> None:
+def test_first_estimates_and_times_of_faults_are_drawn_from_the_intervals_of_the_text() -> None:
     generator = torch.Generator().manual_seed(3)
-    short = faults.short_period(400, generator)
-    assert short.after[7].tolist() == [-1.175, 0.9871, -8.458, -0.8776, 0.7, 0.0]
-    drawn = short.adaptive.theta[:, :4]
+    drawn = faults.short_period(400, generator).adaptive.theta[:, :4]
     assert -5 <= float(drawn.min()) < -4.9
     assert 4.9 < float(drawn.max()) <= 5
     lost = faults.unstable(50, generator)
-    assert lost.after.unique(dim=0).tolist() == [[0.5, 1.0]]
     assert 0.1 <= float(lost.at.min()) < float(lost.at.max()) <= 0.5
-    masses = faults.mass(6, generator)
-    assert masses.after[:, 0].tolist() == [2.0, 0.5] * 3  # 1 / mass
-    assert torch.equal(masses.before, masses.after)
-    assert bool((masses.x0[:, 0].abs() >= 0.5).all())
+    assert bool((faults.mass(6, generator).x0[:, 0].abs() >= 0.5).all())
 
 
 def test_who_knows_the_fault_pays_least_and_the_adaptive_policy_finds_it() -> None:
@@ -126,12 +124,6 @@ def test_integral_and_derivative_have_a_row_each_and_the_better_one_is_counted()
             assert 0 < best <= middle <= worst
     for what in ("error", "parameter_error"):
         assert result.metrics[f"integral_better_{what}"] in (0, pytest.approx(1 / 3), pytest.approx(2 / 3), 1)
-
-
-@pytest.mark.parametrize("wrong", ["icl.rate=[2,1]", "icl.rate=[0,1]", "settle_time=5"])
-def test_gains_that_are_no_range_and_a_run_that_never_settles_are_refused(wrong: str, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=rf"`staf {wrong.partition('=')[0]}=...` must be"):
-        run(tmp_path, "experiment=icl", "trajectories=1", "dt=0.1", "duration=0.2", "icl.length=[1,1]", wrong)
 
 
 def test_in_the_box_only_the_policies_of_barrier_coordinates_stay_where_a_control_can(tmp_path: Path) -> None:
@@ -247,13 +239,13 @@ def test_behind_the_filter_a_unicycle_keeps_off_the_discs_that_its_policy_drives
 
 
 def test_what_is_drawn_of_the_discs_is_a_scenario_in_which_the_bare_policy_comes_nearest() -> None:
-    result = ran("avoidance")
+    result = ran("avoidance of a unicycle")
     plane, apart, share, cost = result.figures[0].axes
     labels = [line.get_label() for line in apart.get_lines()[:2]]
-    assert labels == ["LQR, filtered", "LQR"]
+    assert labels == ["lookahead, filtered", "lookahead"]
     with np.load(result.directory / "history.npz") as history:
         row = int(np.argmin(np.abs(history["distance"] - apart.get_lines()[0].get_ydata()).sum(1)))
-        np.testing.assert_allclose(apart.get_lines()[1].get_ydata(), history["lqr_distance"][row])
+        np.testing.assert_allclose(apart.get_lines()[1].get_ydata(), history["lookahead_distance"][row])
         np.testing.assert_allclose(cost.get_lines()[0].get_ydata(), history["running_cost"][row])
         np.testing.assert_allclose(plane.get_lines()[0].get_xydata(), history["state"][row, :, :2])
         np.testing.assert_allclose(
