@@ -56,25 +56,6 @@ def test_every_law_is_compared_and_the_exact_one_has_the_order_of_its_predictor(
     assert found["a_priori.paper_step"] < found["a_priori.step"] < 0.1
 
 
-def test_the_comparison_has_every_law_at_the_same_work() -> None:
-    assert {type(law) for law in LAWS.values()} == {type(case.law) for case in laws.cases(11, 3)}
-    dear = [case.name for case in laws.cases(11, 3) if case.products > 11]
-    assert dear == ["recursive least squares"]
-    for work, count in ((2, 3), (30, 12)):
-        found = laws.cases(work, count)
-        assert len({case.key for case in found}) == len(found)
-        for case in found:
-            extra = 0 if case.predictor is None else case.predictor.products(count)
-            assert case.products == case.law.products(count, case.iterations) + extra
-        assert {case.key for case in laws.curves(work, count)} <= {case.key for case in found}
-
-
-@pytest.mark.parametrize("steps", ["[2.0,1.0]", "[0.5]"])
-def test_two_steps_within_the_duration_are_needed(steps: str, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"`staf laws.steps=...` must be two or more steps within"):
-        run(tmp_path, "experiment=laws", "duration=1.0", "figures=false", f"laws.steps={steps}")
-
-
 def test_there_is_an_option_for_every_law_and_for_every_predictor() -> None:
     made = [instantiate(OmegaConf.load(path)) for path in options("optimizer").values()]
     assert {type(law) for law in made} == {type(law) for law in LAWS.values()}
@@ -85,14 +66,6 @@ def test_there_is_an_option_for_every_law_and_for_every_predictor() -> None:
         "tangent": predictors.Tangent,
     }
     assert chase_problem(settings("optimizer=nesterov", "optimizer.inner_steps=3")).inner_steps == 3
-
-
-def test_a_certified_chase_counts_its_violations() -> None:
-    problem = chase_problem(settings(*SHORT, "predictor=tangent", "certificate=true"))
-    plain = dataclasses.replace(problem, certificate=False)
-    certified, bare = (chase_batch.simulate([one], [None], [False])[0].metrics for one in (problem, plain))
-    assert certified["certificate_violations"] == 0
-    assert "certificate_violations" not in bare
 
 
 def test_a_memory_knows_the_region_that_passing_models_forget() -> None:
@@ -111,29 +84,30 @@ def test_a_memory_knows_the_region_that_passing_models_forget() -> None:
     assert labels == [*memory.STARTS.values(), "settled chase"]
 
 
-def test_a_memory_of_a_run_that_never_settles_is_refused(tmp_path: Path) -> None:
-    words = ("dt=0.05", "duration=1.0", "figures=false", "settle_time=1.0")
-    with pytest.raises(ValueError, match=r"`staf settle_time=...` must lie within the duration"):
-        run(tmp_path, "experiment=memory", *words)
+def test_the_comparison_has_every_law_at_the_same_work() -> None:
+    assert {type(law) for law in LAWS.values()} == {type(case.law) for case in laws.cases(11, 3)}
+    dear = [case.name for case in laws.cases(11, 3) if case.products > 11]
+    assert dear == ["recursive least squares"]
+    found = laws.cases(30, 12)
+    for case in found:
+        extra = 0 if case.predictor is None else case.predictor.products(12)
+        assert case.products == case.law.products(12, case.iterations) + extra
+    assert {case.key for case in laws.curves(30, 12)} <= {case.key for case in found}
 
 
 def test_more_rows_than_go_through_time_together_change_nothing() -> None:
     """A run goes in blocks of 4096 rows; its history has the rows in their order."""
-    few = ("dt=0.1", "duration=0.3", "settle_time=0.1", "trajectories=4100", "spread=0.4")
+    few = ("dt=0.1", "duration=0.2", "settle_time=0.1", "trajectories=4100", "spread=0.4")
     problem = chase_problem(settings(*few))
-    told: list[int] = []
     kept: dict[int, list[Any]] = {}
     sink = lambda pieces, row, time: kept.setdefault(row, []).append(pieces["state"])  # noqa: E731
-    (blocks,) = chase_batch.simulate([problem], [sink], [True], told.append)
-    assert sum(told) == 4
+    (blocks,) = chase_batch.simulate([problem], [sink], [True])
     assert [*kept] == [0, 4096]
     states = np.concatenate([np.concatenate(pieces, axis=1) for pieces in kept.values()])
-    start = problem.initial_states
-    whole = trajectory(problem.system, start, dt=problem.dt, steps=3, chunk=4)
+    whole = trajectory(problem.system, problem.initial_states, dt=problem.dt, steps=2, chunk=3)
     np.testing.assert_array_equal(states, torch.cat([*whole], dim=1))
-    (few_rows,) = chase_batch.simulate(
-        [dataclasses.replace(problem, initial_states=start[:9])], [None], [True]
-    )
+    alone = dataclasses.replace(problem, initial_states=problem.initial_states[:9])
+    (few_rows,) = chase_batch.simulate([alone], [None], [True])
     for name, array in few_rows.drawn.items():
         np.testing.assert_allclose(blocks.drawn[name], array, rtol=1e-9, atol=1e-12)
 
@@ -149,7 +123,9 @@ def said(*problems: ChaseProblem) -> tuple[list[str], list[chase_batch.Outcome]]
     return [str(each.message) for each in given], found
 
 
-def test_a_problem_alone_is_warned_of_its_farthest_state_and_of_several_each_keeps_its_own() -> None:
+def test_a_problem_alone_is_warned_of_its_farthest_state_and_of_several_each_keeps_its_own(
+    tmp_path: Path,
+) -> None:
     near, away = far("[2.0,0.0]"), far("[12.0,0.0]")
     messages, (outcome,) = said(away)
     assert [message[:11] for message in messages] == ["|x| r = 1.2"]
@@ -161,15 +137,11 @@ def test_a_problem_alone_is_warned_of_its_farthest_state_and_of_several_each_kee
         assert messages == []
         assert one.warnings == ()
         assert [warning[:11] for warning in two.warnings] == ["|x| r = 1.2"]
-
-
-def test_a_warning_of_a_batch_is_given_again_where_a_member_is_written(tmp_path: Path) -> None:
     cfg = settings(*SHORT, "figures=false", "history=false")
     (solved,) = GradientChase().solve([cfg], Progress([].append))
     assert isinstance(solved, ChaseSolution)
-    with pytest.warns(UserWarning, match="of the batch"):
+    with pytest.warns(UserWarning, match="of the batch"):  # where a member is written
         GradientChase().write(cfg, tmp_path, dataclasses.replace(solved, warnings=("of the batch",)))
-    assert [path.name for path in tmp_path.iterdir()] == ["metrics.json"]
 
 
 def test_a_trajectory_that_diverges_is_named_with_its_time(tmp_path: Path) -> None:
@@ -180,13 +152,3 @@ def test_a_trajectory_that_diverges_is_named_with_its_time(tmp_path: Path) -> No
     assert "its weights are frozen from there on" in result.log
     assert "and 5 more trajectories diverged" in result.log
     assert "nothing to report" in result.log
-
-
-def test_the_shape_and_the_size_of_a_batch_follow_from_its_settings() -> None:
-    known: dict[str, Any] = {"dt": 0.1, "duration": 0.3, "trajectories": 3, "history": True}
-    known |= {"centers.count": 5, "initial_state": [1.0, 0.0], "optimizer.inner_steps": 7}
-    chase = GradientChase()
-    assert chase.shape(known) == [3, 7]  # 2.9999999999999996 steps
-    for history, rows in ((True, 16), (False, 1)):
-        assert chase.size(known | {"history": history}) == 8 * 3 * (3 * rows + 17)
-    assert chase.size(known | {"trajectories": "many"}) == 0

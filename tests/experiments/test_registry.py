@@ -9,12 +9,7 @@ from typing import Any, ClassVar
 import pytest
 import torch
 
-from staf_torch.experiments.registry import (
-    EXPERIMENTS,
-    BatchedExperiment,
-    experiment,
-    finite,
-)
+from staf_torch.experiments.registry import EXPERIMENTS, BatchedExperiment, experiment, finite
 
 
 class Mine(BatchedExperiment[Any]):
@@ -40,14 +35,12 @@ def plain(cfg: Any, directory: Path, progress: Any = None) -> dict[str, float | 
     return {}
 
 
-@pytest.mark.parametrize("name", EXPERIMENTS)
-def test_every_name_is_that_of_something_that_is_called_like_an_experiment(name: str) -> None:
-    found = experiment(name)
-    assert callable(found)
-    assert not isinstance(found, type)
-    moves = ("gradient_chase", "adp", "adp_tracking", "avoidance")
-    assert bool(getattr(found, "animates", False)) == (name in moves)
-    assert isinstance(found, BatchedExperiment) == (name in ("gradient_chase", "adp"))
+def test_those_that_move_are_animated_and_two_run_in_batches() -> None:
+    found = {name: experiment(name) for name in EXPERIMENTS}
+    moves = {name for name, each in found.items() if getattr(each, "animates", False)}
+    assert moves == {"gradient_chase", "adp", "adp_tracking", "avoidance"}
+    batched = {name for name, each in found.items() if isinstance(each, BatchedExperiment)}
+    assert batched == {"gradient_chase", "adp"}
 
 
 def test_an_experiment_of_ones_own_is_found_by_its_path() -> None:
@@ -62,10 +55,8 @@ def test_an_experiment_of_ones_own_is_found_by_its_path() -> None:
 @pytest.mark.parametrize(
     ("task", "words"),
     [
-        ("no such one", "must be one of 'gradient_chase'"),
         (None, "must be one of 'gradient_chase'"),
         ("no_such_module.run", r"cannot be imported \(No module named 'no_such_module'\)"),
-        (f"{__name__}.nothing", "cannot be imported .*has no attribute 'nothing'"),
         (f"{__name__}.not_callable", "must be an experiment, which can be called"),
     ],
 )
@@ -76,17 +67,10 @@ def test_what_is_no_experiment_is_refused(task: object, words: str) -> None:
 
 def test_a_batch_shares_all_of_a_setting_but_the_numbers_that_may_differ() -> None:
     shared = Mine().shared
-    assert [shared("number", each) for each in (3, True, "word", None)] == [
-        "number",
-        [True],
-        ["word"],
-        [None],
-    ]
     assert shared("number", [1.0, [2, "a"], False]) == ["number", ["number", ["a"]], [False]]
-    for name in ("group.a", "group.inner.b", "group.other.b", "plain.dotted"):
+    for name in ("group.a", "group.inner.b", "plain.dotted"):
         assert shared(name, 1.0) == "number"
-    for name in ("other", "group", "plain.other", "plain"):
-        assert shared(name, 1.0) == 1.0
+    assert shared("other", 1.0) == shared("group", 1.0) == 1.0
 
 
 def test_what_is_not_finite_is_none() -> None:
