@@ -125,12 +125,17 @@ def test_a_setting_that_breaks_its_rule_is_refused_by_name(setting: Setting, tmp
 PUT_TOGETHER = [
     ("experiment=icl", "icl.gain", [1.0]),
     ("experiment=icl", "icl.rate", ["no", 1.0]),
+    ("experiment=icl", "icl.rate", [2.0, 1.0]),
+    ("experiment=icl", "settle_time", 5.0),
+    ("experiment=laws", "laws.steps", [0.01]),
+    ("experiment=memory", "settle_time", 1.0),
     ("experiment=exponential_bound", "exponential_bound.domain", 0.0),
     ("experiment=exponential_bound", "exponential_bound.states", 1),
     ("experiment=exponential_bound", "exponential_bound.max_degree", -1),
     ("experiment=adp_initial_weights", "adp.critic", 0.0),
     ("experiment=adp_initial_weights", "adp.actor", -1.0),
 ]
+"""Rules of names that are put together, and of more settings than one."""
 
 
 @pytest.mark.parametrize(("given", "name", "value"), PUT_TOGETHER)
@@ -140,31 +145,22 @@ def test_a_setting_whose_name_is_put_together_is_refused_by_it(
     refused((given,), name, value, tmp_path / "run")
 
 
-OTHER_KINDS = [
-    (
-        ("experiment=safe_box",),
-        {"system": {"_target_": f"{__name__}.stepped"}},
-        "must be a ControlAffineSystem",
-    ),
-    (
-        (),
-        {"metric": {"_target_": "staf_torch.systems.TwoState"}},
-        "must be a `staf_torch.metrics.Metric`, or several",
-    ),
-]
-
-
 def stepped() -> staf_torch.systems.Plant:
     """A plant in steps, which has no rate."""
     return staf_torch.systems.StepPlant(lambda x, u: 0.9 * x + u, dim=2, inputs=1, dt=0.1)
 
 
-@pytest.mark.parametrize(("given", "parts", "words"), OTHER_KINDS)
+@pytest.mark.parametrize(
+    ("given", "name", "target", "words"),
+    [
+        (["experiment=safe_box"], "system", f"{__name__}.stepped", "must be a ControlAffineSystem"),
+        ([], "metric", "staf_torch.systems.TwoState", "must be a `staf_torch.metrics.Metric`, or several"),
+    ],
+)
 def test_a_part_of_another_kind_is_refused(
-    given: tuple[str, ...], parts: dict[str, Any], words: str, tmp_path: Path
+    given: list[str], name: str, target: str, words: str, tmp_path: Path
 ) -> None:
     cfg = settings(*given)
-    for name, part in parts.items():
-        cfg[name] = part
+    cfg[name] = {"_target_": target}
     with pytest.raises(ValueError, match=words):
         experiment(cfg.task)(cfg, tmp_path)

@@ -118,12 +118,11 @@ def test_the_plant_and_the_reference_of_concurrent_learning_are_the_published_on
 def test_integral_and_derivative_have_a_row_each_and_the_better_one_is_counted() -> None:
     result = ran("icl")
     assert [row["method"] for row in result.rows("icl")] == ["integral", "derivative"]
-    for name in ("integral", "derivative"):
-        for what in ("error", "parameter_error"):
+    for what in ("error", "parameter_error"):
+        for name in ("integral", "derivative"):
             best, middle, worst = (result.metrics[f"{name}_{what}_{k}"] for k in ("best", "median", "worst"))
             assert 0 < best <= middle <= worst
-    for what in ("error", "parameter_error"):
-        assert result.metrics[f"integral_better_{what}"] in (0, pytest.approx(1 / 3), pytest.approx(2 / 3), 1)
+        assert 3 * result.metrics[f"integral_better_{what}"] in range(4)
 
 
 def test_in_the_box_only_the_policies_of_barrier_coordinates_stay_where_a_control_can(tmp_path: Path) -> None:
@@ -189,14 +188,12 @@ def test_scenarios_begin_at_rest_on_a_circle_clear_of_the_discs() -> None:
     assert x0.equal(avoidance.scenarios(cfg))
     away = torch.full((300,), float(cfg.avoidance.distance), dtype=torch.float64)
     torch.testing.assert_close(x0[:, :2].norm(dim=-1), away)
-    assert 0 <= float(x0[:, 2].min()) < 0.1
-    assert 2 * math.pi - 0.1 < float(x0[:, 2].max()) < 2 * math.pi
+    assert 2 * math.pi - 0.1 < float(x0[:, 2].max() - x0[:, 2].min()) < 2 * math.pi
     discs = x0[:, 3:].reshape(300, 2, 4)
     for part, wide in ((discs[..., :2], 2.0), (discs[..., 2:], 0.7)):
         assert 0.97 * wide < float(part.abs().max()) <= wide
     assert float(avoidance.distance(x0, cfg.avoidance.radius, 3).min()) > 0.6
-    mass = avoidance.scenarios(made("mass", "trajectories=2")[0])
-    assert mass[:, 2:4].abs().max() == 0  # at rest
+    assert avoidance.scenarios(made("mass", "trajectories=2")[0])[:, 2:4].abs().max() == 0  # at rest
     with pytest.raises(ValueError, match="must leave room for a start"):
         avoidance.scenarios(made("mass", "avoidance.radius=9", "trajectories=1")[0])
 
@@ -229,22 +226,14 @@ def test_behind_the_filter_a_unicycle_keeps_off_the_discs_that_its_policy_drives
     metrics = result.metrics
     assert metrics["constraint_violations"] == 0 < metrics["lookahead_constraint_violations"]
     assert metrics["minimum_margin"] > 0 > metrics["lookahead_minimum_margin"]
-    assert [row["method"] for row in result.rows("avoidance")] == ["lookahead, filtered", "lookahead"]
-    with np.load(result.directory / "history.npz") as history:
-        assert history["state"].shape == (3, 16, 11)
-        assert float(history["distance"].min()) == pytest.approx(metrics["minimum_margin"])
-        assert float(history["lookahead_distance"].min()) == pytest.approx(
-            metrics["lookahead_minimum_margin"]
-        )
-
-
-def test_what_is_drawn_of_the_discs_is_a_scenario_in_which_the_bare_policy_comes_nearest() -> None:
-    result = ran("avoidance of a unicycle")
     plane, apart, share, cost = result.figures[0].axes
     labels = [line.get_label() for line in apart.get_lines()[:2]]
     assert labels == ["lookahead, filtered", "lookahead"]
     with np.load(result.directory / "history.npz") as history:
+        assert float(history["distance"].min()) == pytest.approx(metrics["minimum_margin"])
+        # What is drawn is a scenario in which the bare policy comes nearest.
         row = int(np.argmin(np.abs(history["distance"] - apart.get_lines()[0].get_ydata()).sum(1)))
+        assert row == int(np.argmin(history["lookahead_distance"].min(1)))
         np.testing.assert_allclose(apart.get_lines()[1].get_ydata(), history["lookahead_distance"][row])
         np.testing.assert_allclose(cost.get_lines()[0].get_ydata(), history["running_cost"][row])
         np.testing.assert_allclose(plane.get_lines()[0].get_xydata(), history["state"][row, :, :2])
