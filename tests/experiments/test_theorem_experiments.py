@@ -49,18 +49,13 @@ def test_the_bound_of_the_paper_is_far_above_what_is_needed() -> None:
     bound = ran("exponential_bound").metrics
     names = ("N", "S", "count", "one_polynomial_count", "measured_count")
     assert [bound[f"r0.1.eps0.001.{name}"] for name in names] == [3, 2, 21, 10, 10]
-    rows = ran("exponential_bound").rows("exponential_bound")
-    for row in rows:
+    for row in ran("exponential_bound").rows("exponential_bound"):
         assert float(row["measured_count"]) <= float(row["one_polynomial_count"]) <= float(row["count"])
         assert float(row["error"]) <= float(row["epsilon"])
 
 
 def bounds(*more: str) -> theorems.Bounds:
-    small = (
-        "exponential_bound.states=5",
-        "exponential_bound.radii=[0.1]",
-        "exponential_bound.epsilons=[0.1]",
-    )
+    small = [f"exponential_bound.{word}" for word in ("states=5", "radii=[0.1]", "epsilons=[0.1]")]
     return theorems.bounds(settings("experiment=exponential_bound", *small, *more))
 
 
@@ -156,12 +151,10 @@ def test_other_methods_lose_what_the_reference_says_and_plain_cholesky_fails_bel
         assert metrics[f"graded_fails_at_{dtype}_{centers}"] is None
 
 
-def test_the_flat_limit_is_a_gaussian_s_too_and_takes_one_count(tmp_path: Path) -> None:
+def test_the_flat_limit_is_a_gaussian_s_too(tmp_path: Path) -> None:
     few = ("flat_limit.counts=6", "flat_limit.radii.smallest=1e-2", "flat_limit.radii.per_decade=1")
-    result = run(tmp_path, "experiment=flat_limit", "kernel=gaussian", "dtype=float32", *few, "figures=false")
+    result = run(tmp_path, "experiment=flat_limit", "kernel=gaussian", *few, "figures=false")
     assert result.metrics["graded_error_float64"] <= 5e-15
-    rows = result.rows("flat_limit")
-    assert [float(row["radius"]) for row in rows[::2]] == pytest.approx([1e-2, 1e-1, 0.5], rel=1e-6)
 
 
 @pytest.mark.parametrize(
