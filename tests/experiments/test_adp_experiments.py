@@ -88,8 +88,7 @@ def test_trajectories_that_do_not_come_to_rest_are_counted(caplog: pytest.LogCap
     plant, cost = systems.VanDerPol(), adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
     x0 = tensor([[2.0, 0.0], [0.0, -1.5], [0.0, 0.0]])
     idle = adp.Feedback(lambda x: torch.zeros_like(x[..., :1]))
-    for policy in (idle, adp.Feedback(adp.LQR(plant, cost))):
-        count_the_restless(cost, adp.simulate(policy, plant, cost, x0, dt=0.1, steps=80, compile=False))
+    count_the_restless(cost, adp.simulate(idle, plant, cost, x0, dt=0.1, steps=80, compile=False))
     (said,) = [line for line in caplog.messages if "not regulated" in line]
     assert said.startswith("2 of 3 trajectories are not regulated: in the last quarter of the 8 s")
 
