@@ -78,9 +78,26 @@ class Arena:
         change(found)
         (self.many / path).write_text(json.dumps(found))
 
-    def override(self, job: int, text: str) -> None:
+    def records(self, change: Callable[[dict], Any]) -> None:
+        """Change the record of every job."""
+        for job in range(3):
+            self.json(f"{job}/run.json", change)
+
+    def override(self, job: object, text: str) -> None:
         """One more override of a job."""
         self.json(f"{job}/run.json", lambda found: found["overrides"].append(text))
+
+    def kernels(self, *values: str) -> None:
+        """The jobs are said to have had these kernels."""
+        for job, value in enumerate(values):
+            self.override(job, f"kernel={value}")
+
+    def metric(self, job: int, name: str) -> None:
+        """One more metric of a job."""
+        self.json(f"{job}/metrics.json", lambda found: found.update({name: 1.0}))
+
+    def failed(self, job: int, reason: str) -> None:
+        self.json(f"{job}/run.json", lambda found: found.update(status="failed", reason=reason))
 
     def swept(self, *texts: str) -> None:
         """More overrides of the sweep."""

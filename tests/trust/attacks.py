@@ -21,8 +21,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import attacks_on_exports as attacks_on_exports
-import attacks_on_newer as attacks_on_newer
-import attacks_on_records as attacks_on_records
 import attacks_on_sweeps as attacks_on_sweeps
 import attacks_on_tables as attacks_on_tables
 from arena import ATTACKS, CONTROLS, SECRET, Arena

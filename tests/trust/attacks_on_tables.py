@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import os
@@ -15,12 +16,9 @@ from arena import Arena, Attack, attack, says
 
 @attack
 def controls_beyond_escape(arena: Arena) -> Attack:
-    def change(found: dict[str, Any]) -> None:
-        found["overrides"].append("kernel=\x9b2Jx\u202egnp\u2066\x07\x7f")
-        found["status"], found["reason"] = "failed", "\x9d52;c;ZWNobyBoaQ==\x9c \x1bP+q\x1b\\ \x0b\x0c\x08"
-
-    arena.json("0/run.json", change)
-    arena.json("1/metrics.json", lambda found: found.__setitem__("\u202e\x1b]0;x\x07ball", 1.0))
+    arena.kernels("\x9b2Jx\u202egnp\u2066\x07\x7f")
+    arena.failed(0, "\x9d52;c;ZWNobyBoaQ==\x9c \x1bP+q\x1b\\ \x0b\x0c\x08")
+    arena.metric(1, "\u202e\x1b]0;x\x07ball")
     return arena.table()
 
 
@@ -34,19 +32,10 @@ def controls_in_the_name_of_a_job(arena: Arena) -> Attack:
 
 @attack
 def formulas_of_every_kind(arena: Arena) -> Attack:
-    values = (
-        "@SUM(1+9)",
-        "+1+cmd|' /C calc'!A0",
-        "-2+3+cmd|'!A0",
-        "\t=cmd|'!A0",
-        "\r=1+1",
-        "\uff1d1+1",
-        " =1+1",
-    )
-    for job in range(3):
-        arena.override(job, f"kernel={values[job]}")
-        arena.json(f"{job}/metrics.json", lambda found, job=job: found.__setitem__(values[job + 3], 1.0))
-    arena.json("2/run.json", lambda found: found.update(status="failed", reason=values[6]))
+    arena.kernels("@SUM(1+9)", "+1+cmd|' /C calc'!A0", "-2+3+cmd|'!A0")
+    for job, value in enumerate(("\t=cmd|'!A0", "\r=1+1", "\uff1d1+1")):
+        arena.metric(job, value)
+    arena.failed(2, " =1+1")
 
     def check(arena: Arena, result: Any) -> str | None:
         import csv
@@ -60,10 +49,8 @@ def formulas_of_every_kind(arena: Arena) -> Attack:
 
 @attack
 def tex_in_caret_notation(arena: Arena) -> Attack:
-    values = (r"^^5cinput{/etc/passwd}", r"\write18{touch x}", "%\n\\input{/etc/passwd}")
-    for job in range(3):
-        arena.override(job, f"kernel={values[job]}")
-    arena.json("0/run.json", lambda found: found.update(status="failed", reason="x\n\\input{/etc/passwd}"))
+    arena.kernels(r"^^5cinput{/etc/passwd}", r"\write18{touch x}", "%\n\\input{/etc/passwd}")
+    arena.failed(0, "x\n\\input{/etc/passwd}")
 
     def check(arena: Arena, result: Any) -> str | None:
         lines = [line.split("%")[0].replace(r"\textbackslash", "") for line in result.text.splitlines()]
@@ -75,14 +62,9 @@ def tex_in_caret_notation(arena: Arena) -> Attack:
 
 @attack
 def links_and_scripts_in_markdown(arena: Arena) -> Attack:
-    values = ("[x](javascript:alert(1))", "![x](http://h.example/p.png)", "<img src=x onerror=alert(1)>")
-    for job in range(3):
-        arena.override(job, f"kernel={values[job]}")
-    arena.json("0/metrics.json", lambda found: found.__setitem__("a|b\n\n<script>alert(1)</script>\n", 1.0))
-    arena.json(
-        "1/run.json",
-        lambda found: found.update(status="failed", reason="http://h.example/?q [y]: http://h.example/"),
-    )
+    arena.kernels("[x](javascript:alert(1))", "![x](http://h.example/p.png)", "<img src=x onerror=alert(1)>")
+    arena.metric(0, "a|b\n\n<script>alert(1)</script>\n")
+    arena.failed(1, "http://h.example/?q [y]: http://h.example/")
 
     def check(arena: Arena, result: Any) -> str | None:
         bad = re.findall(r"(?<!\\)<(?:img|script)|(?<!\\)\]\(|(?<!\\)!\[", result.text)
@@ -94,14 +76,9 @@ def links_and_scripts_in_markdown(arena: Arena) -> Attack:
 @attack
 def a_page_of_the_sweep(arena: Arena) -> Attack:
     evil = "</script></style><script>alert(1)</script><img src=x onerror=alert(1)>\"'><svg/onload=alert(1)>"
-    arena.json(
-        "0/run.json",
-        lambda found: (
-            found["overrides"].append(f"kernel={evil}"),
-            found.update(status="failed", reason=evil),
-        ),
-    )
-    arena.json("1/metrics.json", lambda found: found.__setitem__(evil, 1.0))
+    arena.kernels(evil)
+    arena.failed(0, evil)
+    arena.metric(1, evil)
     (arena.many / "multirun.yaml").write_text(f"x: '{evil}'\n")
 
     def check(arena: Arena, result: Any) -> str | None:
@@ -124,12 +101,8 @@ def a_loop_of_links(arena: Arena) -> Attack:
 def files_that_are_no_files(arena: Arena) -> Attack:
     os.mkfifo(arena.many / ".lock")
     (arena.many / "0" / "metrics.json").unlink()
-    server = socket.socket(socket.AF_UNIX)
-    here = os.getcwd()
-    os.chdir(arena.many / "0")  # a socket's path may have 107 bytes
-    server.bind("metrics.json")
-    os.chdir(here)
-    server.close()
+    with contextlib.chdir(arena.many / "0"), socket.socket(socket.AF_UNIX) as server:
+        server.bind("metrics.json")  # a socket's path may have 107 bytes
     (arena.many / "1" / "run.json").unlink()
     (arena.many / "1" / "run.json").symlink_to("/dev/stdin")
     (arena.many / "2" / "metrics.json").unlink()
@@ -164,40 +137,21 @@ def twenty_thousand_folders(arena: Arena) -> Attack:
 
 @attack
 def folders_a_thousand_deep(arena: Arena) -> Attack:
-    here, start = os.open(arena.many / "0", os.O_RDONLY), os.getcwd()
-    os.fchdir(here)
-    for _ in range(1500):
-        os.mkdir("d")
-        os.chdir("d")
-    Path("run.json").write_text("{}")
-    os.chdir(start)
-    os.close(here)
+    with contextlib.chdir(arena.many / "0"):
+        for _ in range(1500):
+            os.mkdir("d")
+            os.chdir("d")
+        Path("run.json").write_text("{}")
     return ["staf-table", str(arena.hostile)], None
 
 
 @attack
 def rows_of_every_type(arena: Arena) -> Attack:
-    rows = [
-        1,
-        None,
-        [],
-        {},
-        {"overrides": {"a": 1}},
-        {"overrides": [1, None], "metrics": [1]},
-        {"status": ["completed"]},
-    ]
-    rows += [
-        {
-            "number": "x",
-            "overrides": ["seed=1"],
-            "status": "completed",
-            "reason": {},
-            "metrics": {"ball_error": {"a": []}},
-        }
-    ]
-    rows += [
-        {"number": 10**400, "overrides": "seed=1", "metrics": {"ball_error": 10**400, "b": "1e5", "c": True}}
-    ]
+    rows: list[Any] = [1, None, [], {}, {"overrides": {"a": 1}}, {"status": ["completed"]}]
+    rows += [{"overrides": [1, None], "metrics": [1]}]
+    wrong = {"number": "x", "overrides": ["seed=1"], "reason": {}, "metrics": {"ball_error": {"a": []}}}
+    large = {"ball_error": 10**400, "b": "1e5", "c": True}
+    rows += [{"status": "completed"} | wrong, {"number": 10**400, "overrides": "seed=1", "metrics": large}]
     lines = "".join(json.dumps(row) + ",\n" for row in rows)
     (arena.many / "0" / "rows.json").write_text(json.dumps(rows))
     (arena.many / "1" / "rows.json").write_text('{"version": "1", "rows": [\n' + lines + "]}\n")
@@ -212,3 +166,24 @@ def numbers_of_every_type_for_jobs(arena: Arena) -> Attack:
     ]
     arena.json("sweep.json", lambda found: found.update(jobs=jobs))
     return arena.table()
+
+
+@attack
+def an_override_of_a_million_commas(arena: Arena) -> Attack:
+    """A table has a column a setting, and looks for what was swept among all of them."""
+    many = [f"key{k}={','.join(['1'] * 50)}" for k in range(30_000)]
+    arena.records(lambda found: found["overrides"].extend(many))
+    for job in range(3):
+        swept = dict.fromkeys((line[:9] for line in many), job)
+        arena.json(f"{job}/run.json", lambda found, swept=swept: found["settings"].update(swept))
+    return arena.table("--format", "csv")
+
+
+@attack
+def a_table_written_over_its_source(arena: Arena) -> Attack:
+    """A link in the place of the file that is asked for, and a folder that leads elsewhere."""
+    (arena.cwd / "table.csv").symlink_to(arena.many / "table.csv")
+    for name in ("table.csv", "table.md", "report.html"):
+        (arena.many / name).unlink(missing_ok=True)
+        (arena.many / name).symlink_to(arena.victim / "note.txt")
+    return arena.table("--format", "csv", "--output", str(arena.many / "table.csv"))
