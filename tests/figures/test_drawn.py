@@ -49,19 +49,6 @@ def of_a_chase() -> Drawn:
     return Drawn(figure, shown, ["state $x$", "value", "weights", "error at $x$; excess $F$"], names)
 
 
-def of_a_memory() -> Drawn:
-    errors, excess = {"kept": wave(9), "fresh": wave(9) + 1}, {"zero": wave(4), "stored": wave(4) + 1}
-    picture = chase.MemoryPicture(wave(9, 3), wave(5, 3) + 1, wave(5), T, errors, excess, 0.3)
-    figure = chase.draw_memory(picture)
-    np.testing.assert_allclose(figure.axes[0].collections[0].get_offsets()[:, 0], picture.stored[:, 0])
-    shown = [(part[:, 0], part[:, 1]) for part in (picture.path, picture.stored)]
-    shown += [(T, values) for values in errors.values()]
-    shown += [(np.arange(1, 5), values) for values in excess.values()] + [([0, 1], np.array([0.3, 0.3]))]
-    panels = ["$x_2$", r"$\max\,|V - \hat V|$ on the ball", "largest excess"]
-    names = ["path", "stored model", *errors, *excess, "settled chase"]
-    return Drawn(figure, shown, panels, names)
-
-
 def of_a_loop(weights: int, shooting: bool) -> Drawn:
     known = np.where(np.arange(9) % 2, wave(9), np.nan) if shooting else np.linspace(1, 2, 9)
     parts = [wave(9, 2), wave(9, 1), wave(9, weights), wave(9, weights) + 1, wave(9)]
@@ -120,56 +107,14 @@ def of_faults() -> Drawn:
     return Drawn(figure, [(T, values) for case in each for values in case], panels, names)
 
 
-def of_gain_sets() -> Drawn:
-    theta, followed, error, parameter = (
-        {name: wave(*shape) + k for k, name in enumerate(("integral", "derivative"))}
-        for shape in ((9, 3), (9,), (4,), (5,))
-    )
-    sets = closed_loop.GainSets(T, theta["integral"], wave(3), error, parameter, followed)
-    shown = [(T, theta["integral"]), (T, np.tile(wave(3), (9, 1)))]
-    shown += [(T, values) for values in followed.values()]
-    for values in (*error.values(), *parameter.values()):  # sorted, as a share of the sets
-        shown.append((np.sort(values), np.arange(1, len(values) + 1) / len(values)))
-    panels = [r"parameters $\hat\theta$", "$|x - x_d|$", *["share of gain sets"] * 2]
-    names = ["estimates", "true", *["integral", "derivative"] * 3]
-    return Drawn(closed_loop.draw_gain_sets(sets), shown, panels, names)
-
-
-def of_a_convergence() -> Drawn:
-    step, values = np.array([0.01, 0.02, 0.05]), (wave(3), wave(3) + 1)
-    slopes = zip("ab", values, (1.97, None), strict=True)
-    figure = chase.draw_convergence([chase.ConvergenceCurve(n, step, v, slope) for n, v, slope in slopes])
-    panels = ["largest excess before the correction"]
-    return Drawn(figure, [(step, each) for each in values], panels, ["a: 2.0", "b: -"])
-
-
-def of_layouts() -> Drawn:
-    """By family, and the first four of one against the radius."""
-    tried = [*(("rings", count) for count in (3, 6, 10, 15, 21)), ("polygon", 3), ("simplex", 3)]
-    radii, errors = np.array([0.1, 0.2]), [wave(2) + k for k in range(7)]
-    found = [
-        theory.LayoutCurve(*each, 2, 1e-3 * (k + 1), errors[k], None if k else 2.0)
-        for k, each in enumerate(tried)
-    ]
-    shown = [([3, 6, 10, 15, 21], 1e-3 * np.arange(1, 6)), ([3], np.array([6e-3])), ([3], np.array([7e-3]))]
-    shown += [(radii, errors[k]) for k in (0, 1, 2, 3, 5)]
-    names = ["rings", "polygon", "simplex", "rings, 3: 2.00", *(f"rings, {n}: -" for n in (6, 10, 15))]
-    panels = [r"$\sup\,|V - \hat V|$ on the ball"] * 2  # one below the other in a column
-    return Drawn(theory.draw_layouts(found, 0.2, radii), shown, panels, [*names, "polygon, 3: -"])
-
-
 FIGURES: dict[str, Callable[[], Drawn]] = {
     "a chase": of_a_chase,
-    "a memory": of_a_memory,
     "a loop that learns": lambda: of_a_loop(3, True),
     "a loop of many functions": lambda: of_a_loop(7, False),
     "a feedback": lambda: of_a_loop(0, False),
     "a tracked path": of_a_tracked_path,
     "a box": of_a_box,
     "faults": of_faults,
-    "gain sets": of_gain_sets,
-    "a convergence": of_a_convergence,
-    "layouts": of_layouts,
 }
 
 

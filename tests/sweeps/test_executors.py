@@ -206,7 +206,7 @@ def test_an_experiment_without_batches_runs_whole_in_the_worker_and_its_log_come
     assert sys.path == ["/theirs", "/both", *path]  # as the command imports
 
 
-# The libraries, by one small fake each; tests/cluster has the real ones
+# submitit, by a small fake: what SLURM reports; tests/cluster has it and Ray themselves
 
 
 class Clusters:
@@ -218,7 +218,6 @@ class Clusters:
         self.trace = ""  # of jobs that leave it as their result
         self.cancelled: list[str] = []
         self.meanwhile: Callable[[], object] = lambda: None  # while somebody waits for a job
-        self.parameters: dict[str, Any] = {}
 
 
 class Job:
@@ -257,48 +256,21 @@ def clusters(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Clusters:
             self.folder, self.cluster = folder, cluster or "slurm"
 
         def update_parameters(self, **given: Any) -> None:
-            notes.parameters.update(given)
+            assert given == {"name": "staf", "timeout_min": 1440}
 
         def submit(self, task: Any, *arguments: Any) -> Job:
             notes.begun.append("job")
             return Job(notes, self.folder, task, arguments)
 
-    submitit, ray = types.ModuleType("submitit"), types.ModuleType("ray")
+    submitit = types.ModuleType("submitit")
     submitit.AutoExecutor = AutoExecutor  # type: ignore[attr-defined]
-    remote = types.ModuleType("remote")
-    remote.remote = lambda *arguments: notes.begun.append("task") or arguments  # type: ignore[attr-defined]
-    ray.is_initialized = lambda: bool(notes.parameters)  # type: ignore[attr-defined]
-    ray.init = notes.parameters.update  # type: ignore[attr-defined]
-    ray.remote = lambda **_: lambda work: remote  # type: ignore[attr-defined]
-    ray.cluster_resources = lambda: {"CPU": 2.0}  # type: ignore[attr-defined]
-    ray.wait = lambda handles, num_returns: (handles[:1], handles[1:])  # type: ignore[attr-defined]
-    ray.get = lambda handle: solve_elsewhere(*handle)  # type: ignore[attr-defined]
-    ray.shutdown = lambda: notes.cancelled.append("ray")  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "submitit", submitit)
-    monkeypatch.setitem(sys.modules, "ray", ray)
     monkeypatch.chdir(tmp_path)
     return notes
 
 
 def swept(name: str, *more: str) -> staf_torch.sweeps.python_api.Runs:
     return staf_torch.sweep(*SHORT, f"hydra.launcher.executor={name}", *more, directory=name)
-
-
-@pytest.mark.usefixtures("_as_before")
-def test_a_sweep_on_a_cluster_has_the_numbers_of_one_that_is_not(clusters: Clusters) -> None:
-    grid = ["kernel=gaussian,matern", "trajectories=2"]
-    expected = [run.metrics for run in swept("inline", *grid)]
-    given = ["+hydra.launcher.submitit.mem_gb=3", "+hydra.launcher.ray.num_cpus=2"]
-    for name, noted in (("submitit", "job"), ("ray", "task")):
-        clusters.parameters.clear()
-        clusters.begun.clear()
-        assert [run.metrics for run in swept(name, *grid, *given)] == expected
-        assert clusters.begun == [noted] * 2
-        told = {"log_to_driver": False, "include_dashboard": False, "num_cpus": 2}
-        wanted = told if name == "ray" else {"name": "staf", "timeout_min": 1440, "mem_gb": 3}
-        assert clusters.parameters == wanted
-    assert clusters.cancelled == ["ray"]  # begun and ended by whom it belongs to
-    assert len(list(Path("submitit", ".submitit").iterdir())) == 1
 
 
 @pytest.mark.parametrize(
