@@ -152,7 +152,7 @@ def test_each_has_the_properties_an_option_of_the_command_of_the_schema_and_of_t
     assert ended.returncode == 0, ended.stdout[-5000:] + ended.stderr[-5000:]
     found = json.loads(ended.stdout.splitlines()[-1])
     assert " failed" not in found["tests"], found["tests"][-5000:]
-    assert int(found["tests"].split(" passed")[0].split()[-1]) > 40
+    assert int(found["tests"].split(" passed")[0].split()[-1]) > 30
     rows = json.loads(found["table"])
     assert len(rows) == len(RUNS)
     assert {"cauchy", "cautious", "trolley", "damping"} <= {str(v) for row in rows for v in row.values()}
