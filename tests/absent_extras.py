@@ -22,7 +22,9 @@ _HINT = re.compile(r"staf_torch\[(\w+)\]")
 
 def reason(error: BaseException | None) -> str | None:
     """Return which extra an exception, or what it came of, says to be missing; None where it is installed."""
-    while error is not None:
+    seen = set[int]()
+    while error is not None and id(error) not in seen:  # a chain may be a ring
+        seen.add(id(error))
         names = {EXTRAS.get(extra, "") for extra in _HINT.findall(f"{error} {getattr(error, 'stderr', '')}")}
         if isinstance(error, ModuleNotFoundError) and error.name is not None:
             names.add(error.name.partition(".")[0])

@@ -30,6 +30,7 @@ from ..results.files import HISTORY, HYDRA, UnreadableError, read_bytes
 from ..results.run_directory import History
 from ..settings.adp import adp_problem
 from ..settings.chase import chase_problem
+from ..settings.suggestions import chain
 from ..settings.trust import foreign_settings, refusal
 from ..sweeps.hydra_compat import everything_trusted, working_directory_imports
 from ..systems import Units
@@ -144,13 +145,9 @@ def _opened(
         ) from error
 
 
-def _absent(error: BaseException | None) -> str | None:
+def _absent(error: BaseException) -> str | None:
     """Return the module of the user's own that was not found, None where the error is another one."""
-    while error is not None:
-        if isinstance(error, ModuleNotFoundError):
-            return error.name
-        error = error.__cause__ or error.__context__
-    return None
+    return next((each.name for each in chain(error) if isinstance(each, ModuleNotFoundError)), None)
 
 
 def _first_line(error: Exception) -> str:

@@ -24,7 +24,7 @@ from ..experiments.registry import (
 )
 from ..figures.style import in_a_sweep
 from ..settings.plain import to_read
-from ..settings.suggestions import without_option, without_setting
+from ..settings.suggestions import chain, without_option, without_setting
 from ..signs import SHOWN, Progress
 from .workers import LostError
 
@@ -220,11 +220,9 @@ def _group_and_size(settings: Flat, index: int) -> tuple[str, int]:
 
 def sentence(error: BaseException) -> str:
     """The library's own words where Hydra wrapped them, else the error's."""
-    cause: BaseException | None = error
-    while cause is not None:
+    for cause in chain(error, contexts=False):
         if isinstance(cause, ValueError) and not isinstance(cause, OmegaConfBaseException):
             return str(cause).partition("\nfull_key: ")[0]  # a line that Hydra 1.4 adds
-        cause = cause.__cause__
     if isinstance(error, OSError) and not isinstance(error, HydraException) and error.filename:
         return f"cannot write {error.filename}: {error.strerror}"
     unknown = re.match(r"Could not override '(.+?)'", str(error))

@@ -207,7 +207,10 @@ def test_a_history_that_its_settings_do_not_reproduce_is_refused(
     assert not (run / "export").exists()
 
 
-def test_settings_of_another_version_are_refused_and_say_which(changed: Callable[..., Path]) -> None:
+def test_settings_of_another_version_are_refused_and_say_which(
+    changed: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("OC_CAUSE", "1")  # OmegaConf then chains errors in a ring, as in a debugger
     run = changed("chase")
     cfg = OmegaConf.load(run / ".hydra" / "config.yaml")
     del cfg["settle_time"]

@@ -191,6 +191,7 @@ OTHERS = "; others come with the extras joblib, slurm, ray and optuna"
         (chained(HydraException("wrapped"), RuntimeError("between"), ValueError("ours")), "ours"),
         (chained(RuntimeError("theirs"), OmegaConfBaseException("omega")), "theirs"),
         (DISK, "cannot write a/file: No space left"),
+        (chained(*[RuntimeError("of itself")] * 2), "of itself"),
         (
             ConfigKeyError("Could not override 'centers.raduis'.\nKey is not there"),
             "there is no setting `centers.raduis`; did you mean `centers.radius`?",
