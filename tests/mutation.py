@@ -2,19 +2,23 @@
 
     python tests/mutation.py [--sample 100] [--seed 1] [--jobs 2] [--seconds 60] [--room kernels optim]
 
-A mutant runs the files of tests that say most of its module's public names, those of its own room first, in
-a process and a copy of the tree of its own, until one fails or its time is over. Those that survive are
-printed. It is a lamp and no score: many changes do no harm, and other files of tests may notice.
+Coverage measures once which test executes which line (a run of the suite; `--remap` measures again). A
+mutant runs the tests that execute its line, short ones first, in a process and a copy of the tree of its
+own, until one fails or there is no time for more. Those that survive are printed. It is a lamp and no
+score: many changes do no harm.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
+import compileall
 import contextlib
 import copy
-import functools
+import itertools
+import json
 import os
+import py_compile
 import queue
 import random
 import re
@@ -29,11 +33,18 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import coverage
+import pytest
+
 ROOT = Path(__file__).resolve().parent.parent
+CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "staf_torch-mutation"
+MEASURED, SECONDS = CACHE / "coverage", CACHE / "seconds.json"
+SETTINGS = "[run]\nsource = staf_torch\nrelative_files = true\ncore = ctrace\n"
 PAIRS = "Lt LtE, Gt GtE, Eq NotEq, Is IsNot, In NotIn, Add Sub, Mult Div, BitAnd BitOr, And Or"
 OPERATORS = {a: b for pair in PAIRS.split(", ") for a, b in (pair.split(), pair.split()[::-1])}
 OPERATORS |= dict.fromkeys(("FloorDiv", "Mod", "Pow"), "Mult")
 SAYS = ("warn", "info", "debug", "warning", "error")  # calls that only say something
+SOONEST = 0.3  # share of a mutant's time that its tests take without it: what takes all of it hangs
 
 
 # --- what is changed ----------------------------------------------------------------------------------------
@@ -112,62 +123,129 @@ def changes(node: ast.AST) -> Iterator[tuple[ast.expr | ast.stmt, str]]:
         yield node, f"({ast.unparse(node.operand)})"
     elif isinstance(node, ast.Constant) and isinstance(node.value, bool | int | float):
         value = node.value
-        changed = not value if isinstance(value, bool) else value + 1 if value == int(value) else 2 * value
+        changed = (
+            not value
+            if isinstance(value, bool)
+            else value + 1
+            if isinstance(value, int)
+            else value * 2 or 1.0
+        )
         yield node, repr(changed)
     elif isinstance(node, ast.If | ast.IfExp | ast.While):
         yield node.test, f"(not ({ast.unparse(node.test)}))"
     elif isinstance(node, ast.Raise) or (isinstance(node, ast.Expr) and isinstance(node.value, ast.Call)):
         yield node, "pass"
+    elif isinstance(node, ast.Call):
+        for keyword in node.keywords:
+            if keyword.arg not in (None, "stacklevel", "maxsplit"):
+                fewer = copy.copy(node)
+                fewer.keywords = [each for each in node.keywords if each is not keyword]
+                yield node, ast.unparse(fewer)
+
+
+# --- which tests execute what -------------------------------------------------------------------------------
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    """As a plugin of the run that is measured: what each test that passes takes."""
+    _taken[report.nodeid] = _taken.get(report.nodeid, 0.0) + report.duration
+    if not report.passed:
+        _failed.add(report.nodeid)
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Write it down, but in the workers of pytest-xdist."""
+    if not hasattr(session.config, "workerinput"):
+        kept = {name: seconds for name, seconds in _taken.items() if name not in _failed}
+        Path(os.environ["STAF_MUTATION_SECONDS"]).write_text(json.dumps(kept), encoding="utf-8")
+
+
+_taken: dict[str, float] = {}
+_failed: set[str] = set()
+
+
+def measure(tree: Path, jobs: int, tests: Sequence[str]) -> None:
+    """Run the suite once, and keep which test executed which line, and what each takes."""
+    CACHE.mkdir(parents=True, exist_ok=True)
+    (CACHE / "coveragerc").write_text(SETTINGS, encoding="utf-8")
+    line = ["-m", "pytest", "-q", "-p", "mutation", "-p", "no:cacheprovider", "--tb=no", f"-n{jobs}"]
+    line += [
+        "--cov=staf_torch",
+        "--cov-context=test",
+        "--cov-report=",
+        f"--cov-config={CACHE / 'coveragerc'}",
+    ]
+    told = {"COVERAGE_FILE": str(MEASURED), "STAF_MUTATION_SECONDS": str(SECONDS)}
+    subprocess.run([sys.executable, *line, *tests], cwd=tree, env=environment(tree) | told, check=False)
+
+
+def environment(tree: Path) -> dict[str, str]:
+    """In which tests run: the package of a tree, and a cache of programs that mutants share."""
+    path = os.pathsep.join(str(tree / part) for part in ("", "staf_torch/plugins", "tests"))
+    own = {"PYTHONPATH": path, "XDG_CACHE_HOME": str(CACHE / "programs"), "PYTHONDONTWRITEBYTECODE": "1"}
+    return {**os.environ, **own, "OMP_NUM_THREADS": "1"}
+
+
+def tests_of(mutant: Mutant, data: coverage.CoverageData, taken: dict[str, float], most: float) -> list[str]:
+    """Tests that execute the line, the short ones first; of a line that runs at import those of the file."""
+    lines = data.contexts_by_lineno(mutant.file)
+    own = {each for line in range(mutant.line, mutant.last + 1) for each in lines.get(line, ())} - {""}
+    names = {each.rpartition("|")[0] for each in own or {each for line in lines.values() for each in line}}
+    known = sorted(names & taken.keys(), key=lambda name: (taken[name], name))[:300]
+    until = itertools.accumulate(taken[name] for name in known)
+    return [name for name, seconds in zip(known, until, strict=True) if seconds < most] or files_that_name(
+        mutant
+    )
+
+
+def files_that_name(mutant: Mutant) -> list[str]:
+    """For what only other processes execute: files of tests that name the module."""
+    word = re.compile(rf"\b{Path(mutant.file).stem}\b")
+    files = [path.relative_to(ROOT) for path in sorted((ROOT / "tests").rglob("test_*.py"))]
+    return [str(path) for path in files if word.search((ROOT / path).read_text(encoding="utf-8"))][:5]
 
 
 # --- what becomes of a mutant -------------------------------------------------------------------------------
 
 
-@functools.cache
-def words_of_tests() -> dict[str, set[str]]:
-    """Files of tests, and the words in each."""
-    files = sorted((ROOT / "tests").rglob("test_*.py"))
-    return {str(p.relative_to(ROOT)): set(re.findall(r"\w+", p.read_text(encoding="utf-8"))) for p in files}
-
-
-def tests_of(file: str) -> list[str]:
-    """At most six files of tests that say most of the public names of a module, those of its room first."""
-    tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
-    names = {each.name for each in tree.body if isinstance(each, ast.ClassDef | ast.FunctionDef)}
-    names = {name for name in names | {Path(file).stem} if name[0] != "_"}
-    room = f"tests/{file.split('/')[1]}/"
-    stem = Path(file).stem
-    rank = {
-        test: (test.startswith(room), stem in test, len(names & words))
-        for test, words in words_of_tests().items()
-    }
-    return sorted((test for test in rank if rank[test][2]), key=lambda test: rank[test], reverse=True)[:6]
-
-
-def judged(mutant: Mutant, tree: Path, seconds: float) -> str:
-    """Run tests on a mutant: "killed", "out of time", or "survives"."""
-    path, tests = tree / mutant.file, tests_of(mutant.file)
+def judged(mutant: Mutant, tree: Path, tests: Sequence[str], seconds: float) -> str:
+    """Run tests on a mutant: "killed", "hangs", "survives", or why nothing can be said."""
     if not tests:
-        return "survives: no test names it"
+        return "survives: no test executes it"
+    path = tree / mutant.file
     source = path.read_text(encoding="utf-8")
     path.write_text(mutant.applied(source), encoding="utf-8")
     line = [sys.executable, "-m", "pytest", "-x", "-q", "-n0", "-p", "no:cacheprovider", "--tb=no", *tests]
     line = ["bash", "-c", 'ulimit -v 25000000; exec "$@"', "_", *line]  # kB
-    python = os.pathsep.join(str(tree / part) for part in ("", "staf_torch/plugins", "tests"))
-    own = {"PYTHONPATH": python, "PYTHONDONTWRITEBYTECODE": "1", "OMP_NUM_THREADS": "1"}
-    quiet = subprocess.DEVNULL
-    process = subprocess.Popen(
-        line, cwd=tree, env={**os.environ, **own}, start_new_session=True, stdout=quiet, stderr=quiet
-    )
-    try:
-        return "killed" if process.wait(seconds) else "survives"
-    except subprocess.TimeoutExpired:
-        return "out of time"
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-        path.write_text(source, encoding="utf-8")
+    with (tree / "said.txt").open("w+", encoding="utf-8") as said:
+        process = subprocess.Popen(
+            line, cwd=tree, env=environment(tree), start_new_session=True, stdout=said, stderr=said
+        )
+        try:
+            code = process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            return "hangs"
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+            path.write_text(source, encoding="utf-8")
+        said.seek(0)
+        if code == 5 or "no match in any of" in said.read():  # such a test is no longer there
+            return "unknown: the map is old, --remap"
+    return "killed" if code else "survives"
+
+
+def copied(into: Path) -> Path:
+    """The files of the working tree that git knows, compiled so that a changed file is compiled anew."""
+    named = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True)
+    for name in filter(None, named.stdout.split("\0")):
+        if (ROOT / name).is_file():
+            (into / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, into / name)
+    mode = py_compile.PycInvalidationMode.CHECKED_HASH
+    compileall.compile_dir(into / "staf_torch", quiet=2, invalidation_mode=mode)
+    return into
 
 
 def main() -> None:
@@ -181,14 +259,21 @@ def main() -> None:
     begun, found = time.monotonic(), dict[Mutant, str]()
     with tempfile.TemporaryDirectory(prefix="staf-mutation-") as scratch:
         trees: queue.Queue[Path] = queue.Queue()
-        hidden = shutil.ignore_patterns(".*", "__pycache__", "runs")
         for job in range(options.jobs):
-            trees.put(Path(shutil.copytree(ROOT, Path(scratch, str(job)), ignore=hidden)))
+            trees.put(copied(Path(scratch, str(job))))
+        if options.remap or not SECONDS.exists():
+            measure(Path(scratch, "0"), options.jobs, options.tests)
+        taken = json.loads(SECONDS.read_text(encoding="utf-8"))
+        data = coverage.CoverageData(str(MEASURED))
+        data.read()
+        tests = {each: tests_of(each, data, taken, SOONEST * options.seconds) for each in sample}
 
         def tried(mutant: Mutant) -> None:
             tree = trees.get()
-            found[mutant] = judged(mutant, tree, options.seconds)
-            trees.put(tree)
+            try:
+                found[mutant] = judged(mutant, tree, tests[mutant], options.seconds)
+            finally:
+                trees.put(tree)
             print(f"[{len(found)}/{len(sample)}] {mutant}: {found[mutant]}", flush=True)
 
         with ThreadPoolExecutor(options.jobs) as pool:
@@ -206,6 +291,8 @@ def _options() -> argparse.Namespace:
         parser.add_argument(name, type=int, default=usual)
     parser.add_argument("--seconds", type=float, default=60.0, help="for a mutant")
     parser.add_argument("--room", nargs="*", help="of the package; all by default")
+    parser.add_argument("--remap", action="store_true", help="measure again which test executes what")
+    parser.add_argument("--tests", nargs="*", default=["tests"], help="that are measured; all by default")
     return parser.parse_args()
 
 

@@ -65,19 +65,6 @@ def of_a_loop(weights: int, shooting: bool) -> Drawn:
     return Drawn(figure, shown, ["state $x$", *middle, "$|u - u^*|$", r"$|V^* - \hat V|$", "cost"], names)
 
 
-def of_a_tracked_path() -> Drawn:
-    errors = {"identified": wave(9), "exact": wave(9) + 1}
-    parts = wave(9, 4), errors, wave(9, 6), wave(6), wave(9, 3)
-    figure = closed_loop.draw_tracking(closed_loop.TrackingHistory(T, *parts))
-    error, desired = parts[0][:, :2], parts[0][:, 2:]
-    shown = [(T, part) for part in (error + desired, desired, *errors.values(), parts[2], parts[4])]
-    shown += [(T, np.tile(parts[3], (9, 1)))]
-    names = ["$x_1$", "$x_2$", "desired", *errors, "estimates", "true"]
-    names += [rf"$\hat W_{{c,{i + 1}}}$" for i in range(3)]
-    panels = ["state", "$|x - x_d|$", r"drift parameters $\hat\theta$", r"critic $\hat W_c$"]
-    return Drawn(figure, shown, panels, names)
-
-
 def of_a_box() -> Drawn:
     paths, margins, costs = (
         {name: wave(9, *size) + k for k, name in enumerate("ab")} for size in ((3,), (), ())
@@ -112,7 +99,6 @@ FIGURES: dict[str, Callable[[], Drawn]] = {
     "a loop that learns": lambda: of_a_loop(3, True),
     "a loop of many functions": lambda: of_a_loop(7, False),
     "a feedback": lambda: of_a_loop(0, False),
-    "a tracked path": of_a_tracked_path,
     "a box": of_a_box,
     "faults": of_faults,
 }
