@@ -30,8 +30,8 @@ from ..results.files import HISTORY, HYDRA, UnreadableError, read_bytes
 from ..results.run_directory import History
 from ..settings.adp import adp_problem
 from ..settings.chase import chase_problem
-from ..settings.suggestions import chain
 from ..settings.trust import foreign_settings, refusal
+from ..sweeps.batching import chain
 from ..sweeps.hydra_compat import everything_trusted, working_directory_imports
 from ..systems import Units
 

@@ -238,7 +238,7 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         self._streams_ = self._begin(count, outputs, torch.zeros(x.shape[-1], dtype=dtype, device=x.device))
         self._shape_, self._targets_ = tuple(x.shape), tuple(y.shape)
         self._dtype_, self._device_ = dtype, x.device
-        self._in_place_ = self._streams_.dtype if self._streams_.compiled else None  # of a bank float64 alone
+        self._in_place_ = self._streams_.dtype if self._streams_.compiled else None  # not the samples' dtype
         self._direct_ = self._streams_.direct(self._shape_, self._targets_)
         self.n_features_in_ = x.shape[-1]
         self.n_streams_ = None if x.dim() == 1 else count

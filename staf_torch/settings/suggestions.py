@@ -77,15 +77,3 @@ def _keys(tree: Mapping[str, Any], before: str = "") -> Iterator[str]:
         if key not in ("defaults", "_target_", "hydra"):
             yield f"{before}{key}"
             yield from _keys(value, f"{before}{key}.") if isinstance(value, dict) else ()
-
-
-def chain(error: BaseException | None, *, contexts: bool = True) -> Iterator[BaseException]:
-    """Yield an error, its cause, or what it arose from where ``contexts`` count, and so on.
-
-    Each comes once: OmegaConf makes rings of them under a debugger, and so does ``raise error from error``.
-    """
-    seen = set[int]()
-    while error is not None and id(error) not in seen:
-        seen.add(id(error))
-        yield error
-        error = error.__cause__ or (error.__context__ if contexts else None)

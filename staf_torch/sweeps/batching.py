@@ -6,7 +6,7 @@ import dataclasses
 import json
 import logging
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,7 +24,7 @@ from ..experiments.registry import (
 )
 from ..figures.style import in_a_sweep
 from ..settings.plain import to_read
-from ..settings.suggestions import chain, without_option, without_setting
+from ..settings.suggestions import without_option, without_setting
 from ..signs import SHOWN, Progress
 from .workers import LostError
 
@@ -216,6 +216,18 @@ def _group_and_size(settings: Flat, index: int) -> tuple[str, int]:
     except _UNREADABLE:
         pass
     return key, size
+
+
+def chain(error: BaseException | None, *, contexts: bool = True) -> Iterator[BaseException]:
+    """Yield an error, its cause, or what it arose from where ``contexts`` count, and so on.
+
+    Each comes once: OmegaConf makes rings of them under a debugger, and so does ``raise error from error``.
+    """
+    seen = set[int]()
+    while error is not None and id(error) not in seen:
+        seen.add(id(error))
+        yield error
+        error = error.__cause__ or (error.__context__ if contexts else None)
 
 
 def sentence(error: BaseException) -> str:

@@ -21,7 +21,6 @@ from hydra import compose, initialize
 from hydra.utils import instantiate
 
 from staf_torch import Kernel, StateFollowingCenters, optim, systems
-from staf_torch.settings.chase import centers_of
 
 APP = ROOT / "tests" / "examples" / "own_app.py"
 
@@ -99,12 +98,3 @@ def test_an_option_of_each_group_instantiates_in_an_application_that_has_our_sea
     for option, kind in CHOSEN.items():
         more = {"dim": 3} if option == "centers=ball" else {}
         assert isinstance(instantiate(cfg[option.partition("=")[0]], **more), kind), option
-
-
-def test_a_layout_without_a_dimension_asks_for_it() -> None:
-    with pytest.raises(ValueError, match=r"`centers\(dim=...\)` must be given for the layout simplex"):
-        centers_of("simplex")
-    with pytest.raises(
-        ValueError, match=r"`staf centers.directions=...` must be a list of points; got '\?\?\?'"
-    ):
-        centers_of("directions", directions="???")
