@@ -18,7 +18,7 @@ from .filter_program import KernelFilter
 from .kalman_filter import LocalFilter
 from .local_functions import LocalFunctions, OwnFunctions
 from .samples import in_place
-from .stream_state import StreamState, blocks_of
+from .stream_state import LANES, StreamState, blocks_of
 
 NATIVE = Path(__file__).with_name("native")
 """The folder of the C++ of this room."""
@@ -147,7 +147,7 @@ class CompiledFilter:
             return KernelFilter(definition, state)
         if not state.blocks.is_cpu:
             return definition
-        sizes = f"DIM={state.dim}", f"COUNT={state.count}", f"OUTPUTS={state.outputs}"
+        sizes = f"DIM={state.dim}", f"COUNT={state.count}", f"OUTPUTS={state.outputs}", f"LANES={LANES}"
         call = compiled(NATIVE / "_filter.cpp", *sizes, f"REAL={real}", *(["OWN=1"] if own else []))
         return definition if call is None else cls(definition, state, call)
 

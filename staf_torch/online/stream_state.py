@@ -8,7 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-LANES = 8  # streams whose numbers stand together: the double precision numbers of a vector register
+LANES = {"AVX512": 8, "AVX2": 4}.get(torch.backends.cpu.get_cpu_capability(), 2)
+"""Streams whose numbers stand together: the double precision numbers of a vector register."""
 
 
 @dataclasses.dataclass

@@ -73,10 +73,12 @@ static double apart(const Rules &r, const Stream &s, const double *a, const doub
 
 // Lane which[l] of a, or of b from `lanes` on.
 INLINE V picked(V a, V b, Mask which) {
-#ifdef __clang__  // which has no builtin of it for lanes that are not constants
-    V found;
-    for (int l = 0; l < lanes; ++l) found[l] = which[l] < lanes ? a[which[l]] : b[which[l] - lanes];
-    return found;
+#if defined(__clang__) || !WHOLE_512  // clang has no builtin of it, and g++ none that is fast elsewhere
+    double from[2 * lanes], found[lanes];
+    __builtin_memcpy(from, &a, sizeof a), __builtin_memcpy(from + lanes, &b, sizeof b);
+    for (int l = 0; l < lanes; ++l) found[l] = from[which[l]];
+    __builtin_memcpy(&a, found, sizeof a);
+    return a;
 #else
     return __builtin_shuffle(a, b, which);
 #endif
@@ -96,6 +98,17 @@ static int choose(const Rules &r, const Stream &s, const double *x, int chosen[s
     std::partial_sort(index, index + most, index + count, [&](int a, int b) { return s.order[a] > s.order[b]; });
     std::copy(index, index + most, chosen[1]);
     return most;
+}
+
+// Takes what the columns before column k of a factor explain off some of its entries, which stay in registers.
+template <int some> INLINE void take_off(V (*a)[near + 1], int k, int i, int p) {
+    Piece left[some];
+    for (int q = 0; q < some; ++q) left[q] = piece(&a[k][i + q], p);
+    for (int j = 0; j < k; ++j) {
+        const Piece factor = piece(&a[j][k], p);
+        for (int q = 0; q < some; ++q) left[q] -= piece(&a[j][i + q], p) * factor;
+    }
+    for (int q = 0; q < some; ++q) piece(&a[k][i + q], p) = left[q];
 }
 
 // The local Gaussian processes of what the linear model leaves: means and variances at x, in units.
@@ -118,7 +131,7 @@ static void local_processes(const Rules &r, const Stream &s, double now, const d
         std::copy(u, u + n, at[h][count]);
     }
     when[count] = now;
-    static thread_local V gram[groups][near + 1][near + 1];
+    static thread_local V gram[groups][near][near + 1];  // by columns: where factors are taken off, they are read along
     const double *w = r.width_rates, *f = r.fade_rates;
     const V exponents = -V{w[0], w[1], w[2], w[0], w[1], w[2], f[0], f[1]};  // nearest, latest, by age
     Mask width[groups], fade[groups];
@@ -140,30 +153,31 @@ static void local_processes(const Rules &r, const Stream &s, double now, const d
             const double age = std::fabs(when[i] - when[j]);
             const V e = exponential(exponents * V{nearest, nearest, nearest, latest, latest, latest, age, age});
             for (int g = 0; g < groups; ++g)
-                gram[g][i][j] = picked(e, e, width[g]) * picked(e, all(1), fade[g]);
+                gram[g][j][i] = picked(e, e, width[g]) * picked(e, all(1), fade[g]);
         }
     for (int g = 0; g < groups; ++g) {
         auto &a = gram[g];
         V beta[K][near], mean[K], amplitude[K], seen{}, zero{};
         for (int o = 0; o < K; ++o) mean[o] = amplitude[o] = zero;
-        for (int k = 0; k < count; ++k) {  // right-looking: the columns of the factor, and the solutions with them
+        for (int k = 0; k < count; ++k) {  // the columns of the factor, and the solutions with them
+            for (int p = 0; p < pieces; ++p) {
+                int i = k;
+                for (; i + 4 <= count + 1; i += 4) take_off<4>(a, k, i, p);
+                for (; i <= count; ++i) take_off<1>(a, k, i, p);
+            }
             V pivot = maximum(a[k][k] + noise[g], noise[g]);  // a Schur complement is no smaller than the noise
             const V inverse = 1. / root(pivot);
-            for (int i = k + 1; i <= count; ++i) a[i][k] *= inverse;
+            for (int i = k + 1; i <= count; ++i) a[k][i] *= inverse;
             for (int o = 0; o < K; ++o) {
                 V sum;
                 for (int l = 0; l < lanes; ++l) sum[l] = rest[(g * lanes + l) / 18][o][k];
-                for (int j = 0; j < k; ++j) sum -= a[k][j] * beta[o][j];
+                for (int j = 0; j < k; ++j) sum -= a[j][k] * beta[o][j];
                 beta[o][k] = sum * inverse;
-                mean[o] += beta[o][k] * a[count][k];
+                mean[o] += beta[o][k] * a[k][count];
                 amplitude[o] += beta[o][k] * beta[o][k];
             }
-            seen += a[count][k] * a[count][k];
+            seen += a[k][count] * a[k][count];
             if (g == 0) found.unknown = std::max(1 - seen[judged_member], 0.);
-            for (int j = k + 1; j < count; ++j) {
-                const V factor = a[j][k];
-                for (int i = j; i <= count; ++i) a[i][j] -= a[i][k] * factor;
-            }
         }
         for (int o = 0; o < K; ++o) {
             amplitude[o] /= double(count);

@@ -33,7 +33,7 @@ typedef float Singles __attribute__((vector_size(lanes * sizeof(float))));
 INLINE V widened(V a) { return a; }
 INLINE V widened(Mask a) { return __builtin_convertvector(a, V); }
 INLINE V widened(Singles a) {
-#ifdef __AVX512F__  // one instruction, where g++ makes five of the general one
+#if WHOLE_512  // one instruction, where g++ makes five of the general one
     return (V)_mm512_cvtps_pd((__m256)a);
 #else
     return __builtin_convertvector(a, V);
@@ -41,7 +41,7 @@ INLINE V widened(Singles a) {
 }
 INLINE void narrowed(V a, V &found) { found = a; }
 INLINE void narrowed(V a, Singles &found) {
-#ifdef __AVX512F__
+#if WHOLE_512
     found = (Singles)_mm512_cvtpd_ps((__m512d)a);
 #else
     found = __builtin_convertvector(a, Singles);

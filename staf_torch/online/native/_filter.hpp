@@ -2,16 +2,25 @@
 //
 // All arithmetic is double, whatever the table holds. No number passes from one lane to another, and a stream
 // alone takes the same path as a thousand: the bits of a stream do not depend on what stands beside it.
-// DIM, COUNT (centers) and OUTPUTS are given on the command line of the compiler.
+// DIM, COUNT (centers), OUTPUTS and LANES are given on the command line of the compiler. Vectors wider than the
+// registers would live in memory, where g++ moves them number by number: a filter takes six times as long.
 
 #pragma once
 
 #include <cmath>
 #include <cstdint>
 #include <limits>
-#if defined(__AVX512F__) && defined(__clang__)
+#ifndef LANES
+#define LANES 8  // of `Bank`, whose members stand in eights
+#endif
+#if defined(__AVX512F__) && LANES == 8
+#define WHOLE_512 1
+#else
+#define WHOLE_512 0
+#endif
+#if WHOLE_512 && defined(__clang__)
 #include <immintrin.h>
-#elif defined(__AVX512F__)  // by the builtins alone: g++ reads that header for a tenth of all its time
+#elif WHOLE_512  // by the builtins alone: g++ reads that header for a tenth of all its time
 #define _mm512_sqrt_pd(a) __builtin_ia32_sqrtpd512_mask(a, a, -1, 4)
 #define _mm512_scalef_pd(a, b) __builtin_ia32_scalefpd512_mask(a, b, a, -1, 4)
 #define _mm512_cvtps_pd(a) __builtin_ia32_cvtps2pd512_mask(a, __m512d{}, -1, 4)
@@ -28,9 +37,9 @@ typedef float __m256 __attribute__((vector_size(32)));
 #else
 #define INLINE static inline __attribute__((always_inline))
 #endif
-typedef double V __attribute__((vector_size(64)));
-typedef int64_t Mask __attribute__((vector_size(64)));  // lanes of 0 or -1
-constexpr int lanes = 8, n = DIM, M = COUNT, K = OUTPUTS;
+typedef double V __attribute__((vector_size(8 * LANES)));
+typedef int64_t Mask __attribute__((vector_size(8 * LANES)));  // lanes of 0 or -1
+constexpr int lanes = LANES, n = DIM, M = COUNT, K = OUTPUTS;
 constexpr double infinity = std::numeric_limits<double>::infinity();
 constexpr double surprise = 25, streak_limit = 8, error_rate = .05, spread_rate = 1e-3, least_part = 1e-3, novel = 4;
 
@@ -39,8 +48,10 @@ INLINE V maximum(V a, V b) { return a > b ? a : b; }
 INLINE V minimum(V a, V b) { return a < b ? a : b; }
 INLINE V absolute(V a) { return a < 0 ? -a : a; }
 INLINE V root(V a) {
-#ifdef __AVX512F__  // the loop is scalar, as std::sqrt may set errno
+#if WHOLE_512  // the loop is scalar, as std::sqrt may set errno
     return (V)_mm512_sqrt_pd((__m512d)a);
+#elif defined(__AVX__) && LANES == 4
+    return (V)__builtin_ia32_sqrtpd256(a);
 #else
     for (int l = 0; l < lanes; ++l) a[l] = std::sqrt(a[l]);
     return a;
@@ -59,22 +70,44 @@ INLINE bool any(Mask m) {
     return found != 0;
 }
 
+// A vector in the pieces that registers hold: what takes time goes through them one after the other, as g++
+// moves a vector of several number by number.
+#if WHOLE_512
+#define PIECE 64
+#elif defined(__AVX__) && LANES >= 4
+#define PIECE 32
+#else
+#define PIECE 16
+#endif
+typedef double Piece __attribute__((vector_size(PIECE), aligned(8), may_alias));
+constexpr int pieces = sizeof(V) / sizeof(Piece);
+INLINE Piece &piece(void *of, int p) { return static_cast<Piece *>(of)[p]; }
+INLINE const Piece &piece(const void *of, int p) { return static_cast<const Piece *>(of)[p]; }
+
 // e^x to an ulp or two, where streams are of floats to 3e-10; 0 below -708, e^709 above it.
-INLINE V exponential(V x) {
-    const V at = minimum(maximum(x, all(-708)), all(709)), shifted = at * 1.4426950408889634 + 0x1.8p52;
-    const V whole = shifted - 0x1.8p52, r = (at - whole * 0x1.62e42feep-1) - whole * 0x1.a39ef35793c76p-33;
+INLINE Piece exponential_of(Piece x) {
+    const Piece least = Piece{} - 708., most = Piece{} + 709., middle = Piece{} + 0x1.8p52;
+    Piece at = x > least ? x : least;
+    at = at < most ? at : most;
+    const Piece shifted = at * 1.4426950408889634 + middle, whole = shifted - middle;
+    const Piece r = (at - whole * 0x1.62e42feep-1) - whole * 0x1.a39ef35793c76p-33;
     constexpr double over[] = {1. / 6227020800, 1. / 479001600, 1. / 39916800, 1. / 3628800, 1. / 362880,
                                1. / 40320, 1. / 5040, 1. / 720, 1. / 120, 1. / 24, 1. / 6, 1. / 2, 1, 1};
     constexpr int first = sizeof(REAL) == sizeof(float) ? 5 : 0;
-    V sum = all(over[first]);
+    Piece sum = Piece{} + over[first];
     for (int j = first + 1; j < 14; ++j) sum = sum * r + over[j];
-#ifdef __AVX512F__
-    const V found = (V)_mm512_scalef_pd((__m512d)sum, (__m512d)whole);
+#if WHOLE_512
+    const Piece found = (Piece)_mm512_scalef_pd((__m512d)sum, (__m512d)whole);
 #else
-    const Mask power = ((Mask)shifted - (Mask)all(0x1.8p52) + 1022) << 52;  // 2^709 e^.3 fits in two steps
-    const V found = sum * (V)power * 2.;
+    typedef decltype(x < x) Lanes;
+    const Lanes power = ((Lanes)shifted - (Lanes)middle + 1022) << 52;  // 2^709 e^.3 fits in two steps
+    const Piece found = sum * (Piece)power * 2.;
 #endif
-    return x < -708. ? V{} : x != x ? x : found;
+    return x < -708. ? Piece{} : x != x ? x : found;
+}
+INLINE V exponential(V x) {
+    for (int p = 0; p < pieces; ++p) piece(&x, p) = exponential_of(piece(&x, p));
+    return x;
 }
 
 #ifdef OWN

@@ -129,11 +129,17 @@ struct Trackers {
         }
     }
     static void product(const Row *matrix, const V *k, int size, V *found) {
-        for (int i = 0; i < size; ++i) {
-            V sum{};
-            for (int j = 0; j < i; ++j, ++matrix) sum += *matrix * k[j], found[j] += *matrix * k[i];
-            found[i] = sum + *matrix++ * k[i];
-        }
+        for (int i = 0; i < size; matrix += ++i)
+            for (int p = 0; p < pieces; ++p) {
+                const Piece own = piece(k + i, p);
+                Piece sum{};
+                for (int j = 0; j < i; ++j) {
+                    const Piece entry = piece(matrix + j, p);
+                    sum += entry * piece(k + j, p);
+                    piece(found + j, p) += entry * own;
+                }
+                piece(found + i, p) = sum + piece(matrix + i, p) * own;
+            }
     }
     // Entry j of a row of its own in every lane.
     static V entry_of(const Row *matrix, const int *row, int j) {
@@ -188,11 +194,16 @@ struct Trackers {
         int place[lanes]{};
         if (any(full)) give_up(share, learned, grown, s, q, squares, full, place, g, c, diagonal);
         Row *b = known, *a = inverse;
-        for (int i = 0; i < size; ++i) {
-            const V si = learned * s[i], qi = grown * q[i], gi = g[i], ci = c[i], di = diagonal * g[i];
-            for (int j = 0; j <= i; ++j, ++a, ++b) {
-                *b = share * *b + si * s[j] - gi * c[j] - ci * g[j];
-                *a += qi * q[j] - di * g[j];
+        for (int i = 0; i < size; ++i, a += i, b += i) {
+            const V by_s = learned * s[i], by_q = grown * q[i], by_g = diagonal * g[i];
+            for (int p = 0; p < pieces; ++p) {
+                const Piece si = piece(&by_s, p), qi = piece(&by_q, p), gi = piece(g + i, p), ci = piece(c + i, p);
+                const Piece di = piece(&by_g, p), kept = piece(&share, p);
+                for (int j = 0; j <= i; ++j) {
+                    const Piece gj = piece(g + j, p), sj = piece(s + j, p), qj = piece(q + j, p), cj = piece(c + j, p);
+                    piece(b + j, p) = kept * piece(b + j, p) + si * sj - gi * cj - ci * gj;
+                    piece(a + j, p) += qi * qj - di * gj;
+                }
             }
         }
         for (int l = 0; l < lanes; ++l) {
