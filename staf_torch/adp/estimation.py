@@ -16,7 +16,7 @@ from ..numerics.angles import periods_of, wrap_each
 from ..numerics.checks import fail, non_negative, object_of, one_or_each, positive, trailing, vector
 from ..numerics.derivatives import row_jacobian
 from ..numerics.riccati import measured, product
-from ..numerics.row_checks import check_rows
+from ..numerics.rows import check_rows
 from ..systems import Plant
 from .loop.controller import Carried, Controller
 from .problem.cost import Output, matvec

@@ -17,7 +17,7 @@ from ..lanes.threads import small
 from ..local_basis import Degrees, LocalBasis, LocalSpace
 from ..numerics.checks import beside_batch, fail, learns, sampled, trailing, values_of
 from ..numerics.default_device import beside
-from ..numerics.row_checks import check_kernel
+from ..numerics.rows import check_kernel
 from .coefficient_format import compare, decode, encode, record
 
 Target = Callable[[Tensor], Tensor]

@@ -9,8 +9,7 @@ from torch import Tensor
 
 from ..centers import probe_points
 from ..numerics.checks import integer
-from ..numerics.linalg import condition_number
-from ..numerics.pivoted_cholesky import pivoted_cholesky
+from ..numerics.linalg import condition_number, pivoted_cholesky
 from .basis import StaFBasis, Target
 
 

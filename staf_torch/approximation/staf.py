@@ -16,7 +16,7 @@ from ..lanes.threads import alone
 from ..numerics.checks import beside_batch, choice, fail, fails, flag, hold, integer, trailing
 from ..numerics.default_device import beside
 from ..numerics.derivatives import row_jacobian
-from ..numerics.row_checks import check_target
+from ..numerics.rows import check_target
 from .basis import StaFBasis, Target
 
 _MODES = ("partial", "total_frozen_weights", "total")

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from ..lanes.per_row.objects import OfRows
 from ..lanes.row_numbers import RowNumbers
 from ..numerics.checks import fail, hold, kept, non_negative, positive, shown, trailing, values_of
-from ..numerics.row_checks import check_radius
+from ..numerics.rows import check_radius
 
 
 class Radius(nn.Module, metaclass=OfRows):

@@ -10,7 +10,7 @@ from torch import Tensor
 from ..approximation.basis import StaFBasis, Target
 from ..lanes import each
 from ..numerics.checks import fail, integer, object_of, sampled, trailing
-from ..numerics.row_checks import check_law, check_target
+from ..numerics.rows import check_law, check_target
 from ..optim.base import LawState, UpdateLaw
 from ..optim.objective import NativeError
 from .predictors import Predictor

@@ -7,7 +7,7 @@ from typing import NamedTuple
 from torch import Tensor
 
 from ..kernels import Kernel
-from ..numerics.pivoted_cholesky import PivotedCholesky, pivoted_cholesky
+from ..numerics.linalg import PivotedCholesky, pivoted_cholesky
 from .base import (
     at_points,
     evaluate_scaled,

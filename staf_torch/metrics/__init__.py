@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..numerics.row_checks import check_metric
+from ..numerics.rows import check_metric
 from ..results.run import MetricInfo
 
 __all__ = ["Metric", "MetricInfo"]

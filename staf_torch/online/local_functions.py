@@ -11,8 +11,7 @@ from torch import Tensor
 from ..kernels import Kernel
 from ..lanes.row_numbers import RowNumbers, all_rows, columns
 from ..numerics.checks import fail, fails, own_number
-from ..numerics.linalg import root
-from ..numerics.pivoted_cholesky import newton_basis
+from ..numerics.linalg import newton_basis, root
 
 _JUMP = 4.0  # radii: beyond, a kernel whose scale grows with the state says nothing about the new one
 _FAR = 1e8  # radii: beyond, no kernel does, and the squares of a user's kernel may overflow

@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from ..numerics.pivoted_cholesky import pivoted_cholesky
+from ..numerics.linalg import pivoted_cholesky
 
 
 class Objective(Protocol):

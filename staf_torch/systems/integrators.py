@@ -23,8 +23,16 @@ from ..lanes.trace.step import Step
 from ..lanes.tree import Tree
 from ..numerics.checks import fail, integer, positive_real, trailing
 from ..numerics.default_device import beside
-from ..numerics.exponential_step import BENT, GRACE, MOST, TOLERANCE, TRIED, needed_steps
-from ..numerics.runge_kutta import runge_kutta_mean, runge_kutta_stages
+from ..numerics.runge_kutta import (
+    BENT,
+    GRACE,
+    MOST,
+    TOLERANCE,
+    TRIED,
+    needed_steps,
+    runge_kutta_mean,
+    runge_kutta_stages,
+)
 from ..signs import Sign
 from .base import ControlAffineSystem
 

@@ -26,8 +26,7 @@ from staf_torch.lanes.trace.factorisations import (
     solve_definite,
     triangular,
 )
-from staf_torch.numerics.linalg import condition_number
-from staf_torch.numerics.pivoted_cholesky import pivoted_cholesky
+from staf_torch.numerics.linalg import condition_number, pivoted_cholesky
 
 SEEDS = st.integers(0, 2**31)
 

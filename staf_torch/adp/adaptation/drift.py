@@ -15,7 +15,7 @@ from ...lanes.row_numbers import nonzero
 from ...numerics.checks import fail, non_negative, positive_real, real, trailing
 from ...numerics.default_device import device_of
 from ...numerics.derivatives import row_jacobian
-from ...numerics.pivoted_cholesky import newton_basis
+from ...numerics.linalg import newton_basis
 from ...numerics.riccati import measured, product
 from ...numerics.rows import chosen
 from ...systems import ControlAffineSystem

@@ -11,7 +11,7 @@ from torch import Tensor
 from ...lanes.reverse_mode import jacrev
 from ...numerics.checks import copied, fail, integer, number
 from ...numerics.default_device import device_of
-from ...numerics.row_checks import check_rows
+from ...numerics.rows import check_rows
 from ...systems import Barrier, Bounds, ControlAffineSystem
 from ..problem.cost import Cost
 

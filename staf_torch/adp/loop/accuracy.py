@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from ...lanes.row_numbers import over_rows, over_some_rows
-from ...numerics.exponential_step import GRACE, MOST, TOLERANCE, TRIED, StepsNeeded, needed_steps
+from ...numerics.runge_kutta import GRACE, MOST, TOLERANCE, TRIED, StepsNeeded, needed_steps
 from ..problem.held_plant import Holding
 
 _log = logging.getLogger(__name__)

@@ -26,8 +26,8 @@ from ...lanes.per_row.each_row import each_row
 from ...lanes.row_numbers import anybodys, over_rows
 from ...numerics.checks import fail, positive_real, trailing
 from ...numerics.default_device import without_numbers
-from ...numerics.exponential_step import TOLERANCE
-from ...numerics.row_checks import is_ours
+from ...numerics.rows import is_ours
+from ...numerics.runge_kutta import TOLERANCE
 from ...systems import ControlAffineSystem, Plant
 from ..problem.cost import Cost
 from ..problem.held_plant import RESOLVED, Holding, Substeps, fewest_and_most

@@ -22,7 +22,7 @@ from ...lanes.tree import flatten, unflatten
 from ...numerics.angles import wrap
 from ...numerics.checks import choice, copied, fail, integer
 from ...numerics.default_device import beside
-from ...numerics.exponential_step import BENT
+from ...numerics.runge_kutta import BENT
 from ...signs import Sign
 from ...systems import Plant
 from ..problem.cost import Cost

@@ -14,7 +14,7 @@ from ...lanes.per_row.objects import made_by_rows
 from ...lanes.row_numbers import all_rows, over_rows, points_of_rows
 from ...numerics.checks import choice, fail, hold, integer, object_of, positive_real
 from ...numerics.linalg import Matrix
-from ...numerics.row_checks import check_rows
+from ...numerics.rows import check_rows
 from ...signs import Sign
 from ...systems import Plant
 from ..problem.cost import QuadraticCost

@@ -26,8 +26,7 @@ from ...lanes.row_numbers import RowNumbers, points_of_rows
 from ...lanes.threads import small
 from ...numerics.checks import fail, integer, object_of, positive_real, trailing
 from ...numerics.default_device import beside, device_of
-from ...numerics.exponential_step import stalls
-from ...numerics.runge_kutta import runge_kutta_loop
+from ...numerics.runge_kutta import runge_kutta_loop, stalls
 from ...systems import Barrier, ControlAffineSystem
 from ...systems.base import spread_of
 from ..loop.controller import LQR, Policy, Value

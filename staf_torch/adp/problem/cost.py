@@ -26,7 +26,7 @@ from ...numerics.checks import (
 from ...numerics.default_device import beside, device_of, without_numbers
 from ...numerics.linalg import Matrix, positive_definite, positive_semidefinite, square
 from ...numerics.repr_text import limits, shown, sizes
-from ...numerics.row_checks import check_rows
+from ...numerics.rows import check_rows
 from ...systems import Bounds, Plant
 from ...systems.base import Limit
 from ...systems.equilibria import resting_input_at

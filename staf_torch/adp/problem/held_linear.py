@@ -19,9 +19,9 @@ from ...lanes.threads import small
 from ...numerics.checks import fail, object_of, positive_real
 from ...numerics.default_device import designed_on_cpu
 from ...numerics.derivatives import STEP, central_slopes
-from ...numerics.exponential_step import quadratic_integral
 from ...numerics.linalg import check_modes, discrete_riccati, exponential, unstabilisable_mode
-from ...numerics.row_checks import check_rows, is_ours
+from ...numerics.rows import check_rows, is_ours
+from ...numerics.runge_kutta import quadratic_integral
 from ...signs import Sign
 from ...systems import Clocked, Plant
 from .cost import Cost

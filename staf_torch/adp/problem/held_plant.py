@@ -18,18 +18,20 @@ from ...lanes.row_numbers import nonzero
 from ...lanes.trace.loops import untraced
 from ...numerics.checks import integer, positive_real
 from ...numerics.default_device import device_of, without_numbers
-from ...numerics.exponential_step import (
+from ...numerics.rows import known_quantile
+from ...numerics.runge_kutta import (
     GRACE,
     MOST,
     TOLERANCE,
     ExponentialStep,
     StepCount,
+    exponential,
     exponential_stages,
     exponential_step,
     fewest_steps,
+    runge_kutta_loop,
+    stage_weights,
 )
-from ...numerics.rows import known_quantile
-from ...numerics.runge_kutta import exponential, runge_kutta_loop, stage_weights
 from ...systems import Clocked, Plant, StepPlant
 from ...systems.base import spread_of
 from .cost import Cost, quadratic

@@ -18,7 +18,7 @@ from ...lanes.per_row.each_row import each_row
 from ...lanes.row_numbers import RowNumbers, nonzero
 from ...numerics.checks import fail, object_of, positive_real
 from ...numerics.default_device import device_of
-from ...numerics.row_checks import check_rows, is_ours
+from ...numerics.rows import check_rows, is_ours
 from ...systems import Bounds, Clocked, ControlAffineSystem, Plant
 from ...systems.equilibria import check_rest
 from ...systems.user_plants import FunctionPlant

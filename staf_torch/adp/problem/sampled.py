@@ -24,7 +24,7 @@ from ...numerics.default_device import beside, device_of
 from ...numerics.derivatives import use_forward_mode
 from ...numerics.linalg import Matrix, discrete_riccati, positive_semidefinite, square, unstabilisable_mode
 from ...numerics.repr_text import limits, sizes
-from ...numerics.row_checks import check_rows, is_ours
+from ...numerics.rows import check_rows, is_ours
 from ...numerics.runge_kutta import runge_kutta_mean, runge_kutta_stages
 from ...systems import Bounds, Plant
 from ...systems.base import Limit

@@ -12,7 +12,7 @@ from ...lanes.per_row.objects import by_rows
 from ...numerics.angles import wrap
 from ...numerics.checks import copied, fail
 from ...numerics.linalg import Matrix
-from ...numerics.row_checks import check_rows
+from ...numerics.rows import check_rows
 from ...systems import Clocked, Plant
 from ...systems.base import Limit
 from .cost import Cost, QuadraticCost

@@ -21,8 +21,7 @@ from ...lanes.reverse_mode import grad, jacrev
 from ...numerics.checks import fail, non_negative, one_or_each, positive, trailing
 from ...numerics.default_device import device_of
 from ...numerics.linalg import shortest_solution
-from ...numerics.row_checks import check_rows
-from ...numerics.rows import known_quantile
+from ...numerics.rows import check_rows, known_quantile
 from ...numerics.runge_kutta import runge_kutta_step
 from ...systems import Bounds, Plant, StepPlant
 from ..problem.held_plant import Holding
