@@ -15,7 +15,7 @@ from ..lanes.per_row.decisions import at_once, is_of_rows, most_of_rows
 from ..lanes.per_row.each_row import spread_rows, tried
 from ..lanes.per_row.kinds import Kind, kinds_of_rows
 from ..lanes.per_row.objects import row_of
-from ..lanes.torch_compile.opaque import opaque
+from ..lanes.torch_compile.operators import opaque
 from ..numerics.checks import choice, flag, positive_real
 from ..numerics.default_device import beside
 from ..signs import Sign

@@ -18,7 +18,7 @@ from ..lanes.per_row.decisions import numbers_of_rows
 from ..lanes.per_row.kinds import Kind, by_kind, of_kinds
 from ..lanes.per_row.objects import refuse_rows
 from ..lanes.row_numbers import all_rows
-from ..lanes.torch_compile.opaque import opaque
+from ..lanes.torch_compile.operators import opaque
 from ..numerics.checks import integer, one_or_each, positive
 from ..numerics.default_device import beside
 from ..numerics.repr_text import shown, sizes

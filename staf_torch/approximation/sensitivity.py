@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..lanes.reverse_mode import grad
+from ..lanes.gradients import grad
 from ..numerics.checks import trailing
 from ..numerics.derivatives import row_jacobian
 from .basis import StaFBasis, Target

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from ..approximation.staf import StaF
-from ..lanes.reverse_mode import grad
+from ..lanes.gradients import grad
 from ..local_basis import GradedSpace
 from ..numerics.checks import hold, positive_real
 

@@ -24,8 +24,8 @@ from ..adp import (
 from ..adp.near_optimal_policy import NearOptimal
 from ..adp.planning.receding_horizon import StrainedPlans
 from ..adp.planning.shooting.optimum import PlanReplay
+from ..lanes.gradients import grad
 from ..lanes.per_row.objects import refuse_rows, row_of
-from ..lanes.reverse_mode import grad
 from ..local_basis.graded import GradedBasis
 from ..numerics.checks import fail, hold, trailing
 from .remembered_policy import RememberedPolicy

@@ -13,9 +13,9 @@ from torch import Tensor
 from ..approximation.basis import StaFBasis, Target
 from ..lanes import Program, Shared
 from ..lanes.calls.choice import ShortCall, undecided
-from ..lanes.device.chunks import beside_history, joined
+from ..lanes.device.kernel import beside_history, joined
 from ..lanes.row_numbers import over_rows
-from ..lanes.torch_compile.opaque import one_operator
+from ..lanes.torch_compile.operators import one_operator
 from ..lanes.tree import plain
 from ..numerics.default_device import beside
 from ..optim.base import UpdateLaw

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..approximation.basis import GramStructure
 from ..lanes import each
-from ..lanes.device.chunks import beside_history
+from ..lanes.device.kernel import beside_history
 from ..local_basis import LocalSpace
 from ..optim.objective import Precomputed, extremes
 from .certificate import Certificate

@@ -13,9 +13,8 @@ from torch import Tensor
 from ..lanes import Program
 from ..lanes.calls.choice import worth
 from ..lanes.calls.inputs import form, ordinary
-from ..lanes.dependencies.lookups import is_users
-from ..lanes.device.chunks import beside_history
-from ..lanes.device.kernel import DeviceCall
+from ..lanes.dependencies.walk import is_users
+from ..lanes.device.kernel import DeviceCall, beside_history
 from ..lanes.tree import flatten, unflatten
 from .problem import Problem
 from .quantities import Numbers

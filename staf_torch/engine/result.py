@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 from torch import Tensor
 
-from ..lanes.device.chunks import joined
+from ..lanes.device.kernel import joined
 from ..numerics.repr_text import count, span
 from .certificate import Certificate
 

@@ -1,13 +1,13 @@
 """Row programs: torch functions of one row, compiled with a row in every vector lane.
 
 Every room imports those before it. `tree` and `row_numbers` are what all inputs are made of, `dependencies`
-is what a step reads and whether it has changed, `threads` has locks, `compilation` the compiler and its
-cache. `calls` checks inputs, chooses between compiled code and plain torch, and prepares calls. `trace`
-writes a step down as a scalar program, `emit` makes C++, C or CUDA of it, `device` runs kernels,
-`trace_files` keeps traces. `adjoint` has gradients. `program` brings these together; `shared_programs`,
-`row_functions`, `loop_program`, `compiled_methods` are programs for many objects, functions, loops and
-methods. Beside them stand `per_row`, objects whose numbers differ from row to row, and `torch_compile`,
-calls within somebody's `torch.compile`.
+is what a step reads and whether it has changed, `threads` has locks, `gradients` derivatives of plain torch,
+`compilation` the compiler and its cache. `calls` checks inputs, chooses between compiled code and plain
+torch, and prepares calls. `trace` writes a step down as a scalar program, `emit` makes C++, C or CUDA of it,
+`device` runs kernels, `adjoint` has gradients, `texts` keeps traces and what is built of them. `program`
+brings these together; `shared_programs` and `compiled_methods` are programs for many objects, functions,
+loops and methods. Beside them stand `per_row`, objects whose numbers differ from row to row, and
+`torch_compile`, calls within somebody's `torch.compile`.
 """
 
 from . import device as device

@@ -12,7 +12,7 @@ from .calls.choice import say, say_transformed
 from .calls.inputs import Given, Where, form, ordinary, seen, seen_by_others, whole
 from .calls.planned_call import PlannedCall
 from .device.kernel import DeviceCall
-from .torch_compile.opaque import one_operator
+from .torch_compile.operators import one_operator
 from .tree import Tree, flatten, unflatten
 
 if TYPE_CHECKING:

@@ -15,14 +15,15 @@ from .calls.choice import say
 from .calls.inputs import Given, one_precision, seen, served, whole
 from .calls.planned_call import Compiled
 from .compilation.compiler import machine_code
-from .dependencies.contents import Contents, Derived
+from .dependencies.contents import Contents
+from .dependencies.walk import Derived
 from .emit.cpp import emit
 from .emit.row_c import RowC
 from .prepared_call import Prepared
 from .row_numbers import over_rows, points_of_rows
 from .texts import Built, Form, kernel, known
 from .threads import ENTRIES, Mutex, alone
-from .torch_compile.opaque import one_operator
+from .torch_compile.operators import one_operator
 from .trace.loops import few_passes, scan, tracing_now
 from .trace.row_independence import doubt, undrawn
 from .trace.step import Step, trace

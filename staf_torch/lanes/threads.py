@@ -18,7 +18,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import torch
 
-from .dependencies.contents import Derived
+from .dependencies.walk import Derived
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")

@@ -14,8 +14,8 @@ from ..approximation.basis import StaFBasis, Target
 from ..centers import probe_points
 from ..lanes import Program, reduce, shared_program
 from ..lanes.calls.choice import PlainTime, undecided, worth
+from ..lanes.gradients import grad
 from ..lanes.per_row.objects import made_by_rows
-from ..lanes.reverse_mode import grad
 from ..lanes.row_numbers import RowNumbers, over_rows, points_of_rows, some_rows
 from ..local_basis import NewtonSpace, evaluate_scaled, scale
 from ..numerics.linalg import condition_number

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ..lanes.calls.inputs import seen_by_others
-from ..lanes.reverse_mode import backward, jacrev, vjp
+from ..lanes.gradients import backward, jacrev, vjp
 
 STEP = 6e-6  # the cube root of the rounding error: a central difference is then good to its square
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from ..kernels import Kernel
 from ..lanes.calls.inputs import seen_by_others
 from ..lanes.threads import ReadWriteLock
-from ..lanes.torch_compile.opaque import opaque
+from ..lanes.torch_compile.operators import opaque
 from ..numerics.checks import fail, integer, trailing
 from ..numerics.default_device import beside, on
 from ..signs import Sign

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from ..approximation.basis import StaFBasis
-from ..lanes.gradients import refuse_gradient
-from ..lanes.reverse_mode import grad
+from ..lanes.gradients import grad, refuse_gradient
 from ..lanes.threads import ReadWriteLock
 from ..numerics.checks import hold, integer, positive_real, trailing
 

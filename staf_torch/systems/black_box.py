@@ -10,8 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..lanes.gradients import defer_gradient, marked
-from ..lanes.reverse_mode import jacrev
+from ..lanes.gradients import defer_gradient, jacrev, marked
 from ..numerics.derivatives import Apart, central_slopes
 from .base import Linearisation
 from .numpy_in_torch import InTorch, agrees

@@ -12,13 +12,13 @@ from torch import Tensor
 
 from ..lanes import Program, repeat
 from ..lanes.calls.choice import DIFFERENTIATED, undecided, worth
-from ..lanes.device.chunks import rows_of, with_rows
+from ..lanes.compiled_methods import LoopProgram
 from ..lanes.device.host import capturing
+from ..lanes.device.kernel import rows_of, with_rows
 from ..lanes.gradients import wants_gradient
-from ..lanes.loop_program import LoopProgram
 from ..lanes.row_numbers import over_rows, over_some_rows, some_rows
 from ..lanes.shared_programs import SharedPrograms
-from ..lanes.torch_compile.opaque import one_operator
+from ..lanes.torch_compile.operators import one_operator
 from ..lanes.trace.step import Step
 from ..lanes.tree import Tree
 from ..numerics.checks import fail, integer, positive_real, trailing

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from ..approximation.basis import StaFBasis, Target
 from ..engine import along, gram_rates
+from ..lanes.gradients import grad
 from ..lanes.per_row.objects import refuse_rows
-from ..lanes.reverse_mode import grad
 from ..numerics.checks import fail, integer, positive_real, trailing
 from ..numerics.linalg import condition_number
 from ..optim import SteepestDescent, UpdateLaw

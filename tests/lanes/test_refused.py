@@ -16,7 +16,7 @@ import staf_torch as st
 from staf_torch import lanes
 from staf_torch.lanes import Program, Shared
 from staf_torch.lanes.dependencies.contents import Contents
-from staf_torch.lanes.row_functions import Rows
+from staf_torch.lanes.shared_programs import Rows
 from staf_torch.lanes.trace.tracer import NotLoweredError
 
 pytestmark = pytest.mark.needs_compiler

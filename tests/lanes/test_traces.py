@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from staf_torch import StaFBasis, StateFollowingCenters, chase_weights, kernels, lanes, optim, rings, targets
 from staf_torch.lanes.program import Program, Step
 from staf_torch.lanes.shared_programs import SharedPrograms
-from staf_torch.lanes.trace_files import unpatched
+from staf_torch.lanes.texts import unpatched
 
 pytestmark = pytest.mark.needs_compiler
 

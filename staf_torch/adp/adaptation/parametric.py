@@ -8,7 +8,7 @@ from typing import ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
-from ...lanes.reverse_mode import jacrev
+from ...lanes.gradients import jacrev
 from ...numerics.checks import copied, fail, integer, number
 from ...numerics.default_device import device_of
 from ...numerics.rows import check_rows

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from ...lanes.dependencies.lookups import is_users
-from ...lanes.dependencies.tensor_writes import Writes
+from ...lanes.dependencies.contents import Writes
+from ...lanes.dependencies.walk import is_users
 from ...lanes.gradients import gradients_of, marked
 from ...lanes.per_row.objects import OfRows
 from ...lanes.row_numbers import over_rows

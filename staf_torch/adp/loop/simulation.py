@@ -12,11 +12,11 @@ from torch import Tensor
 
 from ...lanes import Program
 from ...lanes.calls.choice import DIFFERENTIATED, undecided, worth
-from ...lanes.device.chunks import beside_history, joined, rows_of, with_rows
+from ...lanes.compiled_methods import LoopProgram
+from ...lanes.device.kernel import beside_history, joined, rows_of, with_rows
 from ...lanes.gradients import wants_gradient
-from ...lanes.loop_program import LoopProgram
 from ...lanes.row_numbers import over_rows, some_rows
-from ...lanes.torch_compile.opaque import opaque
+from ...lanes.torch_compile.operators import opaque
 from ...lanes.trace.philox import seed_parts
 from ...lanes.tree import flatten, unflatten
 from ...numerics.angles import wrap

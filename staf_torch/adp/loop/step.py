@@ -178,7 +178,7 @@ def program(loop: ClosedLoop, compile: bool) -> Program:
     """Return ``loop`` over many steps, compiled where that is possible and asked for: it records the state
     before every step, and the control.
 
-    Compiled loops that differ in numbers alone share one text: `lanes.dependencies.told_numbers`.
+    Compiled loops that differ in numbers alone share one text: `lanes.dependencies.contents`.
     """
     make = functools.partial(functools.partial, recorded)
     if not compile:

@@ -21,7 +21,7 @@ from ...lanes.gradients import without_gradient
 from ...lanes.per_row.decisions import numbers_of_rows
 from ...lanes.row_numbers import over_rows, some_rows
 from ...lanes.threads import alone
-from ...lanes.torch_compile.opaque import opaque
+from ...lanes.torch_compile.operators import opaque
 from ...lanes.tree import Tree, flatten, unflatten
 from ...numerics.box import minimum_and_slopes
 from ...numerics.checks import fail, integer, positive_real, trailing

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ...lanes import compiled, repeat, scan, traced_as
-from ...lanes.reverse_mode import grad
+from ...lanes.gradients import grad
 from ...numerics.box import LARGEST, minimum_and_slopes
 from ...numerics.checks import fail, integer, positive_real, trailing
 from ...numerics.derivatives import row_jacobian, use_forward_mode

@@ -14,7 +14,7 @@ from ...lanes.gradients import without_gradient
 from ...lanes.per_row.decisions import numbers_of_rows
 from ...lanes.per_row.objects import refuse_rows
 from ...lanes.row_numbers import some_rows
-from ...lanes.torch_compile.opaque import opaque
+from ...lanes.torch_compile.operators import opaque
 from ...numerics.checks import fail, integer, real
 from ...signs import Sign
 from ...systems import Plant

@@ -8,8 +8,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
+from ...lanes.gradients import grad
 from ...lanes.per_row.objects import OfRows
-from ...lanes.reverse_mode import grad
 from ...numerics.checks import fail, positive_real, trailing
 from ...systems import ControlAffineSystem
 from ..loop.controller import LQR

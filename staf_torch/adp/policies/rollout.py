@@ -17,12 +17,12 @@ from ...lanes import compiled, each, repeat
 from ...lanes.calls import inputs
 from ...lanes.calls.planned_call import PlannedCall
 from ...lanes.dependencies.contents import Contents
+from ...lanes.gradients import grad
 from ...lanes.per_row.each_row import each_row
 from ...lanes.per_row.objects import Rowwise
 from ...lanes.prepared_call import Plan
-from ...lanes.reverse_mode import grad
-from ...lanes.row_functions import Rows, check_states
 from ...lanes.row_numbers import RowNumbers, points_of_rows
+from ...lanes.shared_programs import Rows, check_states
 from ...lanes.threads import small
 from ...numerics.checks import fail, integer, object_of, positive_real, trailing
 from ...numerics.default_device import beside, device_of

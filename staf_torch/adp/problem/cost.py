@@ -9,9 +9,9 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor, nn
 
+from ...lanes.gradients import jacrev
 from ...lanes.per_row.decisions import in_any_row
 from ...lanes.per_row.objects import OfRows, by_rows
-from ...lanes.reverse_mode import jacrev
 from ...lanes.row_numbers import nonzero, value_of
 from ...numerics.angles import periods_of, turned, wrap, wrap_each
 from ...numerics.box import LARGEST, box_minimum, face_inverses

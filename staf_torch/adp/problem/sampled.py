@@ -13,11 +13,10 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from ...lanes import each, traced_as
-from ...lanes.gradients import without_gradient
+from ...lanes.gradients import vjp, without_gradient
 from ...lanes.per_row.decisions import in_any_row
 from ...lanes.per_row.each_row import first_row
 from ...lanes.per_row.objects import Note, OfRows
-from ...lanes.reverse_mode import vjp
 from ...numerics.angles import turned, unwrapped, wrap
 from ...numerics.checks import fail, hold, integer, trailing
 from ...numerics.default_device import beside, device_of

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from ...lanes import compiled, repeat
+from ...lanes.gradients import grad, vjp
 from ...lanes.per_row.objects import OfRows
-from ...lanes.reverse_mode import grad, vjp
 from ...numerics.checks import fail, positive_real, trailing
 from ...numerics.default_device import device_of
 from ...numerics.runge_kutta import runge_kutta_mean, runge_kutta_stages

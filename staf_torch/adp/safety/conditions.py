@@ -16,8 +16,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from ...lanes.gradients import grad, jacrev
 from ...lanes.per_row.decisions import agreed, in_any_row
-from ...lanes.reverse_mode import grad, jacrev
 from ...numerics.checks import fail, non_negative, one_or_each, positive, trailing
 from ...numerics.default_device import device_of
 from ...numerics.linalg import shortest_solution

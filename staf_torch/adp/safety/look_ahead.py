@@ -18,8 +18,8 @@ import torch
 from torch import Tensor, nn
 
 from ...lanes import repeat, where_rows
+from ...lanes.gradients import grad, jacrev
 from ...lanes.per_row.decisions import in_any_row, is_of_rows
-from ...lanes.reverse_mode import grad, jacrev
 from ...lanes.trace.loops import repeat_counted
 from ..loop.controller import Policy
 from .conditions import Conditions, Ends, Lean

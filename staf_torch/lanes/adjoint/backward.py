@@ -21,7 +21,7 @@ from ..trace.captured_tensors import TableSlopes
 from ..trace.row_independence import undrawn
 from ..trace.step import Step
 from ..tree import Shared, flatten, plain
-from .row_sums import UNIT, AtTimes, by_units, empty_rows, halved, joined, part, split
+from .carries import UNIT, AtTimes, by_units, empty_rows, halved, joined, part, split
 from .steps import Deciding, Differentiated, ReversedStep, Substituted, adjoint_step, deciding
 
 if TYPE_CHECKING:

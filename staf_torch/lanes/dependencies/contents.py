@@ -11,55 +11,33 @@ The library's own code, Python's and that of installed packages stands as it is.
 
 from __future__ import annotations
 
-import copyreg
+import copy
+import ctypes
 import functools
-import hashlib
 import io
 import logging
-import math
 import operator
-import pickle
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import chain, repeat
 from operator import is_
-from types import BuiltinFunctionType, CellType, CodeType, FunctionType, MethodType, ModuleType
-from typing import Any, cast
+from types import CodeType, MethodType
+from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
-from torch.nn.utils import parametrize
+from torch import Tensor
 
-from ..row_numbers import RowNumbers
-from .lookups import EMPTY, OF_PYTHON, Lookup, attribute_parts, content_of, installed, is_users, lookups
-from .tensor_writes import Writes
+from ..row_numbers import all_rows
+from .walk import BOUND, EMPTY, OF_PYTHON, READ, Derived, IdentityKey, Walk, content_of, is_users
 
 _PACKAGE = __name__.partition(".")[0]
 _VERSIONED = frozenset((_PACKAGE, "torch", "numpy", *OF_PYTHON))  # other processes have the same
-ATOMS = frozenset((str, int, float, bool, bytes, tuple, type(None)))  # and what an address alone tells apart
-_SMALL = 1 << 14  # bytes of an array that are compared at every call
-_FIXED = (
-    *(tuple, type, frozenset, complex, slice, range, np.generic, np.dtype, torch.dtype, torch.device),
-    *(FunctionType, BuiltinFunctionType, MethodType),
-)
-_CODE = (type, FunctionType, BuiltinFunctionType)
-_OF_EVERY_MODULE = frozenset(vars(nn.Module()))  # looked into by themselves
-_READ = ("training", "_parameters", "_buffers", "_modules", "_forward_hooks", "_forward_pre_hooks")
-IDLE = _OF_EVERY_MODULE - {*_READ}  # hooks of derivatives and of state_dicts, and what goes with other hooks
 _log = logging.getLogger(__name__)
 _said: set[tuple[str, str]] = set()  # what has been logged
-_TOLD = "a number of the table"
 _REQUIRES = operator.attrgetter("requires_grad")
 _CODE_OF, _CONTENT = operator.attrgetter("__code__", "__defaults__"), operator.attrgetter("cell_contents")
-_BASE, _ARRAY = operator.itemgetter(*_READ), operator.methodcaller("tobytes")
-BOUND = "_compiled_methods"
-"""Attribute in which an object holds its compiled methods: no part of what it is."""
-_UNREAD, _HOOKS = IDLE | {BOUND}, ("_forward_hooks", "_forward_pre_hooks")
-
-
-class Derived:
-    """Base of what follows from its recipe in a pickle, as programs do: nothing inside of it is watched."""
+_BASE, _ARRAY = operator.itemgetter(*READ), operator.methodcaller("tobytes")
 
 
 class Contents:
@@ -179,7 +157,7 @@ class Contents:
         text, kept = self.key
         names = [text]
         for value in kept:
-            if isinstance(value, CodeType | _Same):
+            if isinstance(value, CodeType | IdentityKey):
                 return None
             module, name = getattr(value, "__module__", None) or "", value.__qualname__  # type: ignore[attr-defined]
             found: Any = sys.modules.get(module)
@@ -203,229 +181,174 @@ class Contents:
         return chain.from_iterable(found)
 
 
-@functools.lru_cache(maxsize=4096)
-def _is_layer(kind: type) -> bool:
-    """Return whether a class or one of its bases makes parameters, which require gradients by default."""
-    return any(map(_makes_parameters, kind.__mro__))
+_VERSION, _SHAPE = operator.attrgetter("_version"), operator.attrgetter("shape")
+_BYTES = operator.methodcaller("tobytes")
+_SMALL = 1 << 16  # bytes of a tensor that are compared at every call
+_FEW = 64  # numbers of a larger one
 
 
-def _makes_parameters(kind: type) -> bool:
-    root, _, rest = kind.__module__.partition(".")
-    return kind not in (nn.Module, parametrize.ParametrizationList) and (
-        root == "torch" or (root == _PACKAGE and rest.startswith("approximation"))
-    )
+def version(tensor: Tensor) -> int:
+    """Return a number that is another one once the tensor was written to.
 
-
-@functools.lru_cache(maxsize=4096)
-def number(place: int, value: float) -> Tensor:
-    """Return a float64 tensor of a number that no text is to know: of a place and a number always the same.
-
-    Two places never share one: a text would then know that their numbers are equal.
+    Torch counts writes, but not those to tensors made in inference mode: of these it is the content.
     """
-    return torch.tensor(value, dtype=torch.float64, device="cpu")
+    tensor = all_rows(tensor)
+    return hash(tensor.numpy(force=True).tobytes()) if tensor.is_inference() else tensor._version
 
 
-_name_of = functools.cache(str)  # of a dtype, which torch spells anew each time
+class Writes:
+    """The state of tensors now, to be compared later.
 
+    Torch counts writes to a tensor, but none to ``tensor.data`` (``target.data.copy_(...)``) or by NumPy,
+    nor that ``tensor.data = other`` gives it other memory, as `torch.nn.utils.vector_to_parameters` does. So
+    memory of the processor is compared, too: all of it up to 64 kB a tensor and where torch counts nothing,
+    64 numbers of a larger one. On a device it is torch's count alone, as looking waits.
 
-class _Same:
-    """An object as a key: equal to itself alone, and kept, so that its address is used once."""
+    Args:
+        tensors: numbers of rows among them.
+    """
 
-    __slots__ = ("value",)
-
-    def __init__(self, value: object) -> None:
-        self.value = value
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and self.value is other.value
-
-    def __hash__(self) -> int:
-        return id(self.value)
-
-
-class Walk(pickle.Pickler):
-    """Writes everything but floating-point tensors, and notes what may change later."""
-
-    def __init__(self, file: io.BytesIO, telling: bool = False) -> None:
-        super().__init__(file)
-        self.file, self._telling = file, telling
-        self.told: dict[int, tuple[Any, dict[str, Tensor]]] = {}
-        self.kept: list[object] = []  # part of the key: an address is used once
-        self.tensors: list[Tensor] = []
-        self.others: list[Tensor] = []  # whose numbers are part of the key
-        self.dicts: list[dict[Any, Any]] = []
-        self.empty: list[dict[Any, Any]] = []  # most of them the hooks of a module
-        self.modules: list[tuple[dict[str, Any], list[str]]] = []  # attributes, and names of its own ones
-        self.lists: list[list[Any]] = []
-        self.sets: list[set[Any]] = []
-        self.arrays: list[np.ndarray[Any, Any]] = []
-        self.lookups: list[Lookup] = []
-        self.cells: list[CellType] = []
-        self.functions: list[FunctionType] = []
-        self.of_users = False
-        self.unwatched: str | None = None
-        self.layers: set[int] = set()  # parameters that a layer of torch's, or of this library's, made
-        self._states: dict[int, Any] = {}  # containers that are noted, or made on the way
-        self._places: dict[int, int] = {}
-        self._waiting: list[FunctionType | type] = []  # whose surroundings are to be written
-        self._met: dict[int, int] = {}  # of a function or class of a user: its place among the kept
-
-    def finish(self) -> None:
-        """Write what the functions and classes of a user read that were come upon, and so on."""
-        while self._waiting:
-            met = self._waiting.pop()
-            self.dump(_class_parts(met) if isinstance(met, type) else self._function_parts(met))
-
-    def _function_parts(self, function: FunctionType) -> tuple[Any, ...]:
-        """Return what a function reads beside its arguments."""
-        parts: list[Any] = [function.__defaults__, function.__kwdefaults__, vars(function)]
-        for cell in function.__closure__ or ():
-            self.cells.append(cell)
-            content = content_of(cell)
-            if content is EMPTY or (isinstance(content, ModuleType) and is_users(function)):
-                self.kept.append(_Same(content))  # and what the function asks a module for, below
+    def __init__(self, tensors: Sequence[Tensor]) -> None:
+        self._tensors = [*map(all_rows, tensors)]
+        self._placed = [tensor for tensor in self._tensors if _has_memory(tensor)]
+        # Kept, so that other memory cannot come to lie at the same address meanwhile.
+        self._memory = [tensor.untyped_storage() for tensor in self._placed]
+        self._addresses = [*map(Tensor.data_ptr, self._placed)]
+        self._shapes = [*map(_SHAPE, self._tensors)]
+        self._views = list[memoryview]()
+        self._samples = list[np.ndarray[Any, Any]]()
+        for tensor, address in zip(self._placed, self._addresses, strict=True):
+            if not tensor.is_cpu:
+                continue
+            size = tensor.element_size() * (1 + sum(map(_reach, tensor.shape, tensor.stride())))
+            begin = tensor.element_size() * tensor.storage_offset()
+            there = tensor.untyped_storage().nbytes() - begin  # a storage may have been cut off
+            size = int(max(0, min(size, there)))
+            memory = memoryview((ctypes.c_char * size).from_address(address))
+            if size <= _SMALL or tensor.is_inference():
+                self._views.append(memory)
             else:
-                parts.append(content)
-        for lookup in lookups(function) if is_users(function) else ():
-            self.lookups.append(lookup)
-            value = lookup.value
-            parts.append(lookup.name)
-            if isinstance(value, ModuleType) or installed(str(lookup.space.get("__name__", ""))):
-                self.kept.append(_Same(value))
-            else:
-                parts.append(value)
-        return tuple(parts)
+                width = min(tensor.element_size(), 8)
+                self._samples.append(np.frombuffer(memory, f"u{width}")[:: size // (width * _FEW)])
+        # Torch also counts what moves no number: `matrix.t_()`.
+        self._counted = [tensor for tensor in self._tensors if not tensor.is_inference()]
+        self._look()
 
-    def reducer_override(self, value: Any) -> Any:
-        if isinstance(value, nn.Module):
-            kind: Any = type(value)  # which has a hash
-            attributes, owners = vars(value), [value]
-            if "parametrizations" in value._modules and parametrize.is_parametrized(value):
-                kind = parametrize.type_before_parametrizations(value)  # torch's of it refuses to be written
-                owners += cast("nn.ModuleDict", value.parametrizations).values()
-            if _is_layer(kind):
-                self.layers.update(id(part) for owner in owners for part in owner._parameters.values())
-            plain = kind.__getstate__ is object.__getstate__ and not kind.__dict__.get("__slotnames__", True)
-            whole = attributes if plain else kind.__getstate__(value)
-            state = {k: v for k, v in whole.items() if k not in _UNREAD}
-            for hooks in _HOOKS:  # whose keys count all hooks of the process
-                if state.get(hooks):
-                    self.dicts.append(state[hooks])
-                    state[hooks] = tuple(state[hooks].values())
-            if self._telling:
-                self._tell(value, state)
-            self._states[id(state)] = state
-            self.modules.append(
-                (attributes, [k for k in attributes if k in state and k not in _OF_EVERY_MODULE])
-            )
-            return (copyreg.__newobj__, (kind,), state) if kind is type(value) else (kind, (), state)  # type: ignore[attr-defined]
-        held = getattr(value, "__dict__", ())
-        if BOUND in held or (held and self._telling and getattr(type(value), "told", ())):
-            made = list(value.__reduce_ex__(2))
-            made[2] = {k: v for k, v in made[2].items() if k != BOUND}
-            if self._telling:
-                self._tell(value, made[2])
-            self._states[id(made[2])] = made[2]
-            return tuple(made)
-        return NotImplemented
+    def _look(self) -> None:
+        self._versions = [*map(_VERSION, self._counted)]
+        self._contents = [*map(bytearray, self._views)]  # equal to memory of the same bytes, at once
+        self._parts = [*map(_BYTES, self._samples)]
 
-    def _tell(self, value: Any, state: dict[str, Any]) -> None:
-        """Put tensors in the place of the finite floats of an object of the library, in its state."""
+    def again(self) -> Writes:
+        """Return how the same tensors are now."""
+        same = [*map(Tensor.data_ptr, self._placed)] == self._addresses
+        if not same or [*map(_SHAPE, self._tensors)] != self._shapes:
+            return Writes(self._tensors)
+        now = copy.copy(self)
+        now._look()
+        return now
+
+    def alike(self, other: Writes) -> bool:
+        """Return whether tensors had the shapes that they had at another time."""
+        return self._shapes == other._shapes
+
+    def none(self) -> bool:
+        """Return whether nothing was written since."""
+        return (
+            [*map(Tensor.data_ptr, self._placed)] == self._addresses  # first: memory may have been given back
+            and self._contents == self._views
+            and [*map(_VERSION, self._counted)] == self._versions
+            and (not self._samples or [*map(_BYTES, self._samples)] == self._parts)
+        )
+
+
+def _reach(size: int, stride: int) -> int:
+    return (size - 1) * stride
+
+
+def _has_memory(tensor: Tensor) -> bool:
+    """Return whether a tensor lies somewhere: sparse ones, those of a transform or a fake mode do not."""
+    if tensor.layout is not torch.strided or tensor.is_nested or tensor.is_meta:
+        return False
+    try:
+        return tensor.data_ptr() != 0
+    except RuntimeError:
+        return False
+
+
+Told = dict[int, tuple[Any, dict[str, Tensor]]]
+"""Objects by their addresses, and tensors by the names of the floats that they stand for."""
+
+
+def told_copies(told: Told, parts: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Return copies of parts with tensors in the place of told floats, wherever `leads_by_copies`."""
+    return _Copies(told).all(parts)
+
+
+def leads_by_copies(read: Contents, parts: tuple[Any, ...]) -> bool:
+    """Return whether all that leads from a step's parts to told floats, of contents that tell, is copied.
+    A closure or an object of a user's is not: a trace would read the float there."""
+    copies = _Copies(read.told)
+    copies.all(parts)
+    beside = Contents(*copies.others, telling=True)
+    known = read.key is not None and beside.key is not None
+    return known and copies.replaced == read.told.keys() and not (beside.told.keys() & read.told.keys())
+
+
+class _Copies:
+    """Copies of objects that hold told floats, and of all that leads to them.
+
+    Args:
+        told: of `Contents`.
+
+    Attributes:
+        replaced: addresses of the objects that were copied with tensors.
+        others: what was not looked into.
+    """
+
+    def __init__(self, told: Told) -> None:
+        self._told, self.replaced, self.others = told, set[int](), list[Any]()
+        self._made: dict[int, Any] = {}
+
+    def all(self, parts: tuple[Any, ...]) -> tuple[Any, ...]:
+        """Copy these."""
+        return tuple(map(self._of, parts))
+
+    def _of(self, value: Any) -> Any:
+        if isinstance(value, Tensor | str | int | float | type | None):
+            return value
+        if id(value) not in self._made:
+            self._made[id(value)] = value  # within itself
+            self._made[id(value)] = self._copied(value)
+        return self._made[id(value)]
+
+    def _copied(self, value: Any) -> Any:
         kind = type(value)
-        names = getattr(kind, "told", ())
-        if not names or is_users(kind):
-            return
-        told = {}
-        for name in [*state] if names is True else names:
-            real = state.get(name)
-            if type(real) is float and math.isfinite(real):
-                told[name] = number(len(self.tensors), real)
-                self.tensors.append(told[name])
-                state[name] = _TOLD
-        if told:
-            self.told[id(value)] = value, told
-
-    def persistent_id(self, value: Any) -> Any:
-        kind = type(value)
-        if kind in ATOMS:  # most of all: asked for every object
-            return None
+        if kind in (list, tuple):
+            return self._either(value, kind, value)
         if kind is dict:
-            self._note_dict(value)
-            return None
-        if isinstance(value, Tensor):
-            return self._tensor(value)
-        if isinstance(value, _CODE):
-            return self._code(value)
-        if isinstance(value, ModuleType):
-            if not installed(value.__name__):
-                raise pickle.PicklingError(f"the module {value.__name__}, which may change")
-            self.kept.append(_Same(value))
-            return len(self.kept)
-        if isinstance(value, np.ndarray) and not value.dtype.hasobject:
-            if value.nbytes <= _SMALL:
-                self.arrays.append(value)
-            else:
-                self.unwatched = f"an array of {value.nbytes} bytes"
-            # By their digest: keys stay small.
-            return str(value.dtype), value.shape, hashlib.blake2b(value.tobytes()).digest()
-        if kind.__module__ == "itertools":  # Python 3.12 warns of it, 3.14 refuses
-            raise pickle.PicklingError(f"an iterator, {type(value).__name__}")
-        self._note(value)
-        return None
-
-    def _code(self, value: type | FunctionType | BuiltinFunctionType) -> int:
-        """Note a class or function; once where more than its address decides what it does."""
-        users = not isinstance(value, BuiltinFunctionType) and is_users(value)
-        closes = isinstance(value, FunctionType) and value.__closure__ is not None
-        if isinstance(value, BuiltinFunctionType) or not (users or closes):
-            self.kept.append(value)
-            return len(self.kept)
-        if id(value) not in self._met:
-            if isinstance(value, FunctionType):
-                self.functions.append(value)
-            # A lambda is often made anew, of the same code.
-            self.kept.append(value.__code__ if isinstance(value, FunctionType) else value)
-            self.of_users = self.of_users or users
-            self._met[id(value)] = len(self.kept)
-            self._waiting.append(value)
-        return self._met[id(value)]
-
-    def _tensor(self, value: Tensor) -> Any:
-        if not value.is_floating_point():
+            return self._either(value.values(), lambda new: dict(zip(value, new, strict=True)), value)
+        if kind is MethodType:
+            return self._either([value.__self__], lambda new: MethodType(value.__func__, *new), value)
+        if kind is functools.partial:
+            parts = [value.func, value.args, value.keywords]
+            return self._either(parts, lambda new: functools.partial(new[0], *new[1], **new[2]), value)
+        library = kind.__module__.startswith("staf_torch.") and not is_users(kind)
+        if isinstance(value, Derived) or not hasattr(value, "__dict__") or not library:
             self.others.append(value)
-            numbers = b"" if value.is_meta else value.detach().cpu().numpy().tobytes()
-            return str(value.dtype), str(value.device), tuple(value.shape), numbers
-        if id(value) not in self._places:
-            self._places[id(value)] = len(self.tensors)
-            self.tensors.append(value)
-        place = self._places[id(value)]
-        own = isinstance(value, RowNumbers)  # how many rows there are is no matter
-        where = "cpu" if value.is_cpu else str(value.device)
-        return place, own, _name_of(value.dtype), where, tuple(value.shape), value.stride()
+            return value
+        held = {name: part for name, part in vars(value).items() if name != BOUND}
+        new = {name: self._of(part) for name, part in held.items()}
+        if id(value) in self._told:
+            self.replaced.add(id(value))
+            new |= self._told[id(value)][1]
+        elif all(new[name] is held[name] for name in held):
+            return value
+        other: Any = object.__new__(kind)
+        vars(other).update(new)
+        return other
 
-    def _note(self, value: Any) -> None:
-        """Note what may change inside of an object; a module is noted in `reducer_override`."""
-        if isinstance(value, Derived):
-            return
-        if isinstance(value, list):
-            self.lists.append(value)
-        elif isinstance(value, set):
-            self.sets.append(value)
-        elif isinstance(value, dict):
-            self._note_dict(value)
-        if hasattr(value, "__dict__"):
-            if not isinstance(value, nn.Module):
-                self._note_dict(vars(value))
-        elif not isinstance(value, (list, set, dict, *_FIXED)):
-            self.unwatched = f"an object of {type(value).__qualname__}"
-
-    def _note_dict(self, value: dict[Any, Any]) -> None:
-        if id(value) not in self._states:
-            self._states[id(value)] = value
-            (self.dicts if value else self.empty).append(value)
-
-
-def _class_parts(kind: type) -> tuple[Any, ...]:
-    """Return what a user's base classes hold: functions, numbers, containers."""
-    users = [vars(each).items() for each in kind.__mro__ if is_users(each)]
-    return tuple(part for items in users for name, value in items for part in attribute_parts(name, value))
+    def _either(self, parts: Any, build: Callable[[list[Any]], Any], value: Any) -> Any:
+        """Return the container of the copies, itself where there are none."""
+        new = [self._of(part) for part in parts]
+        return value if all(one is old for one, old in zip(new, parts, strict=True)) else build(new)

@@ -21,9 +21,8 @@ import torch
 from torch import Tensor, nn
 
 from ..calls.inputs import Given
-from ..dependencies.contents import BOUND, Contents, Derived
-from ..dependencies.lookups import EMPTY, content_of
-from ..dependencies.told_numbers import leads_by_copies, told_copies
+from ..dependencies.contents import Contents, leads_by_copies, told_copies
+from ..dependencies.walk import BOUND, EMPTY, Derived, content_of
 from ..trace.captured_tensors import Recipe, tensors
 from ..trace.graph import WIDE
 from ..trace.indexing import MOVEMENTS

@@ -19,8 +19,7 @@ import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-from ..dependencies.contents import BOUND, Derived
-from ..dependencies.lookups import EMPTY, content_of
+from ..dependencies.walk import BOUND, EMPTY, Derived, content_of
 from ..row_numbers import RowNumbers, all_rows, column_of, resolving
 from .each_row import in_row, spread_rows, tried, turn_of
 

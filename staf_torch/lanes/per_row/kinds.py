@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..dependencies.contents import BOUND
+from ..dependencies.walk import BOUND
 from ..row_numbers import RowNumbers, columns, in_use, some_rows
 from ..trace.loops import where_rows
 from ..tree import flatten

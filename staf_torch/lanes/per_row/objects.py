@@ -22,7 +22,8 @@ from typing import Any, ParamSpec, TypeVar
 import torch
 from torch import Tensor, nn
 
-from ..dependencies.contents import BOUND, Contents, Derived
+from ..dependencies.contents import Contents
+from ..dependencies.walk import BOUND, Derived
 from ..row_numbers import RowNumbers, all_rows, in_use, over_rows
 from ..tree import Shared, plain
 from .decisions import DecidedByRows, at_once, is_of_rows
@@ -157,7 +158,7 @@ class Rowwise(abc.ABCMeta):
             _serve_rows()
         return made
 
-    told = True  # `told_numbers`: floats of the library's own classes are numbers of a table
+    told = True  # `told_copies`: floats of the library's own classes are numbers of a table
 
 
 class OfRows(Rowwise):

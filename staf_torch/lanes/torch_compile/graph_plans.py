@@ -23,7 +23,7 @@ from ..compiled_methods import CompiledMethod, bound_to
 from ..dependencies.contents import Contents
 from ..prepared_call import Prepared
 from ..program import Program
-from .graph_operator import CALLS, KNOWN, NAMED, GraphCall, Surroundings, TensorForm
+from .operators import CALLS, KNOWN, NAMED, GraphCall, Surroundings, TensorForm
 
 _CONSTANTS = (str, int, float, type(None), torch.dtype, torch.device)
 _NEW = AttributeMutationNew, ValueMutationNew

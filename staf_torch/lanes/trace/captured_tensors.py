@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import _disable_current_modes
 
-from ..dependencies.tensor_writes import version
+from ..dependencies.contents import version
 
 _NO_VALUES = """zeros_like ones_like full_like empty_like rand_like _new_zeros_with_same_feature_meta
     new_zeros new_ones new_full new_empty new_empty_strided lift_fresh lift_fresh_copy"""

@@ -10,7 +10,7 @@ from torch import Tensor
 from ....lanes.gradients import without_gradient
 from ....lanes.per_row.objects import made_by_rows
 from ....lanes.row_numbers import over_rows, points_of_rows, some_rows
-from ....lanes.torch_compile.opaque import opaque
+from ....lanes.torch_compile.operators import opaque
 from ....numerics.checks import fail, integer, positive_real, trailing
 from ....numerics.default_device import beside, on_cpu
 from ....numerics.linalg import Matrix
