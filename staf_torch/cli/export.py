@@ -15,9 +15,9 @@ from torch import Tensor
 
 from .. import __version__
 from ..deploy import c_header, data_sheet, export_learning_c, formats, trace
+from ..deploy.controllers import made_name
 from ..deploy.data_sheet import Port
 from ..deploy.formats import in_loops
-from ..deploy.names import made_name
 from ..lanes.emit.identifiers import checked_names
 from ..numerics.checks import choice, fail
 from ..results.build import processor
@@ -209,11 +209,10 @@ def _write(
 ) -> tuple[formats.Run, data_sheet.Work]:
     names, name, example = [port.name for port in found.outputs], str(origin["name"]), found.points.to(dtype)
     if to == "onnx":
-        written = in_loops(module, example, [found.input.name, *names], batch, name)
+        written = in_loops(module, example, path, [found.input.name, *names], batch, name)
         if written is not None:
-            path.write_bytes(written.model.SerializeToString())
             entries = example.shape[1] + sum(port.size or 1 for port in found.outputs)
-            return formats.runner_onnx(path), written.source.work(entries, dtype)
+            return formats.runner_onnx(path), written.work(entries, dtype)
     program = trace(module, example, batch=batch)
     if to == "onnx":
         formats.export_onnx(program, path, [found.input.name], names, name=name)

@@ -16,7 +16,7 @@ from .formats import export_onnx as export_onnx
 from .formats import export_package as export_package
 from .formats import export_program as export_program
 from .formats import load_program as load_program
-from .graph import trace as trace
+from .formats import trace as trace
 from .remembered_policy import RememberedPolicy as RememberedPolicy
 
 __all__ = [name for name, value in globals().items() if callable(value) and not name.startswith("_")]

@@ -26,10 +26,19 @@ from ..lanes.trace.tracer import NotLoweredError
 from ..lanes.tree import Tree, flatten, labels
 from ..numerics.checks import fail
 from ..signs import Sign
-from .controllers import FilteredPolicy, SupervisedPolicy, check_bounded, in_dtype, searches
+from .controllers import (
+    FilteredPolicy,
+    SupervisedPolicy,
+    check_bounded,
+    check_count,
+    check_dtype,
+    function_name,
+    in_dtype,
+    listed_names,
+    searches,
+)
 from .data_sheet import Latency, Source, counted
 from .formats import Run, as_tuple
-from .names import check_count, check_dtype, function_name, listed_names
 from .remembered_policy import RememberedPolicy
 
 _log = logging.getLogger(__name__)

@@ -14,9 +14,13 @@ import torch
 from torch import Tensor
 from torch.export import ExportedProgram
 
+from ..lanes.calls.inputs import Given
 from ..lanes.emit.schedule import Schedule
 from ..lanes.trace.graph import FIXED
-from ..lanes.trace.step import Traced
+from ..lanes.trace.row_independence import doubt
+from ..lanes.trace.step import Step, Traced
+from ..lanes.trace.step import trace as trace_step
+from ..lanes.trace.tracer import NotLoweredError
 from ..results.files import visible
 from ..signs import Sign
 
@@ -235,3 +239,16 @@ def counted(traced: Traced) -> Source:
         elif op not in _FREE_SCALARS:
             functions += count
     return Source(constants, flops, functions)
+
+
+def traced_row(step: Step, row: Mapping[str, Tensor]) -> Traced | None:
+    """Return the trace of a step of a row without a carry, (1, ...); None where it has no scalar form."""
+    two = {key: part.expand(2, *part.shape[1:]).contiguous() for key, part in row.items()}
+    given = Given.of((), (), two, 1)
+    try:
+        traced = trace_step(step, given, folded=True)
+    except NotLoweredError:
+        return None
+    real = next(iter(row.values())).dtype
+    plain = all(len(shape) < 2 and dtype == real for shape, dtype in traced.outputs)
+    return traced if plain and doubt(step, given) is None else None

@@ -1,27 +1,30 @@
-"""The files: ONNX, `torch.export`, AOTInductor."""
+"""A module as one graph of tensor operations, and the files of it: ONNX, `torch.export`, AOTInductor."""
 
 from __future__ import annotations
 
 import importlib.util
 import json
 import logging
+import math
+import operator
 import os
 import shutil
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 import torch
-from torch import Tensor, nn
-from torch.export import ExportedProgram
+from torch import Tensor, fx, nn
+from torch._decomp import core_aten_decompositions
+from torch.export import Dim, ExportedProgram
+from torch.fx.experimental.proxy_tensor import make_fx
 
 from ..numerics.checks import fail, integer, trailing
 from ..signs import Sign
+from .controllers import check_count, check_dtype, function_name, listed_names
 from .data_sheet import Source
-from .graph import trace
-from .names import check_count, check_dtype, function_name, listed_names
 from .onnx_writer import OnnxWriter
 
 FORMAT = 1
@@ -29,6 +32,9 @@ FORMAT = 1
 _NOTE = "staf_torch.json"
 Run = Callable[[Tensor], tuple[Tensor, ...]]
 """An exported file, loaded: (B, n) -> its outputs."""
+
+
+_TRACED = 3  # rows of the batch while tracing: a size that no other dimension is taken for by chance
 
 
 def need_onnx() -> None:
@@ -57,6 +63,125 @@ def need_compiler() -> None:
             "AOTInductor compiles C++, and there is no compiler here: install g++ (apt-get install g++) "
             f"or name one in the variable CXX; got {compiler!r}. ONNX and pt2 need none."
         )
+
+
+def trace(module: nn.Module, example: Tensor, *, batch: int | None = None) -> ExportedProgram:
+    """The module as a `torch.export` program of core operations, with its constants folded.
+
+    Derivatives inside the module become ordinary operations.
+
+    Example:
+        >>> plant = systems.TwoState()
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> policy = deploy.policy_of(adp.LQR(plant, cost))
+        >>> program = deploy.trace(policy, torch.zeros(1, 2).double())
+        >>> program.module()(torch.tensor([[0.0, 1.0]]).double()).shape
+        torch.Size([1, 1])
+
+        Shown by `staf-export RUN --to pt2`.
+
+    Args:
+        module: (B, n) -> a tensor or a tuple of tensors.
+        example: an input, (B, n) with any B from 1; its values do not matter, its dtype does.
+        batch: B; any by default.
+
+    Raises:
+        ValueError: if an argument breaks its rule, or the module cannot be traced for every batch.
+    """
+    if trailing("trace", "example", example, dims=2).dim() > 2 or not len(example):
+        raise fail("trace", "example", "must be states (B, n), one at least", tuple(example.shape))
+    rows = _TRACED if batch is None else integer("trace", "batch", batch, least=1)
+    x = example[:1].detach().expand(rows, -1).clone()
+    shapes = ({0: Dim("batch", min=1)},) if batch is None else None
+    module = module.eval().requires_grad_(False)
+    with warnings.catch_warnings(action="ignore"), torch.no_grad():  # of the tracer, about its own internals
+        try:
+            # First to operations, derivatives and all, which `torch.export` alone does not take.
+            mode: Literal["symbolic", "real"] = "symbolic" if batch is None else "real"
+            table: Any = core_aten_decompositions()
+            graph = make_fx(module, table, tracing_mode=mode, _allow_non_fake_inputs=True)(x)
+            graph = lift_numbers(fold(graph))
+            program: ExportedProgram = torch.export.export(graph, (x,), dynamic_shapes=shapes)
+            decomposed: ExportedProgram = program.run_decompositions({})
+            return decomposed
+        except Exception as error:  # the tracer raises errors of all sorts
+            raise ValueError(
+                f"`{type(module).__name__}` cannot be exported for "
+                f"{'any batch' if batch is None else f'a batch of {batch}'}: {str(error).splitlines()[0]}"
+            ) from error
+
+
+def fold(graph: fx.GraphModule) -> fx.GraphModule:
+    """Return the graph with every operation on constants alone done once, here."""
+    known: dict[fx.Node, Any] = {}
+    for node in graph.graph.nodes:
+        if node.op == "get_attr":
+            known[node] = operator.attrgetter(str(node.target))(graph)
+        elif node.op == "call_function" and all(parent in known for parent in node.all_input_nodes):
+            made = node.meta.get("val")
+            fixed = isinstance(made, Tensor) and not any(isinstance(n, torch.SymInt) for n in made.shape)
+            if not node.all_input_nodes and not fixed:
+                continue
+            args, kwargs = fx.map_arg((node.args, node.kwargs), known.__getitem__)
+            assert callable(node.target)
+            known[node] = node.target(*args, **kwargs)
+    for number, (node, value) in enumerate(known.items()):
+        used_here = all(user in known for user in node.users)
+        if node.op == "get_attr" or not isinstance(value, Tensor) or used_here:
+            continue
+        name = f"folded_{number}"
+        graph.register_buffer(name, value.detach().clone())
+        with graph.graph.inserting_before(node):
+            constant = graph.graph.get_attr(name)
+        constant.meta = dict(node.meta)
+        node.replace_all_uses_with(constant)
+    graph.graph.eliminate_dead_code()
+    used = {str(node.target) for node in graph.graph.nodes if node.op == "get_attr"}
+    for name, buffer in list(graph.named_buffers()):
+        if name in used:
+            setattr(graph, name, buffer.detach().clone())  # not a view of more than a file should hold
+    for name, _ in [*graph.named_buffers(), *graph.named_parameters()]:
+        if name not in used:
+            delattr(graph, name)
+    graph.recompile()
+    return graph
+
+
+_ATEN = torch.ops.aten
+_TENSOR: dict[Any, Any] = {
+    **{getattr(_ATEN, name).Tensor: getattr(_ATEN, name).Tensor for name in ("add", "sub", "mul", "div")},
+    **{getattr(_ATEN, name).Scalar: getattr(_ATEN, name).Tensor for name in ("add", "sub", "mul", "div")},
+    **{getattr(_ATEN, name).Scalar: getattr(_ATEN, name).Tensor for name in ("le", "lt", "ge", "gt")},
+    _ATEN.pow.Tensor_Scalar: _ATEN.pow.Tensor_Tensor,
+}
+"""Operation: the same between tensors."""
+
+
+def lift_numbers(graph: fx.GraphModule) -> fx.GraphModule:
+    """Return the graph with the numbers that float32 does not hold exactly as constants of their own."""
+    count = 0
+    for node in list(graph.graph.nodes):
+        inexact = [at for at, value in enumerate(node.args) if isinstance(value, float) and _inexact(value)]
+        if node.target not in _TENSOR or not inexact:
+            continue
+        dtype = next(n.meta["val"].dtype for n in node.all_input_nodes if isinstance(n.meta["val"], Tensor))
+        arguments = list(node.args)
+        for at in inexact:
+            name = f"number_{count}"
+            count += 1
+            value = torch.tensor(arguments[at], dtype=dtype, device="cpu")
+            graph.register_buffer(name, value)
+            with graph.graph.inserting_before(node):
+                constant = graph.graph.get_attr(name)
+            constant.meta["val"] = value
+            arguments[at] = constant
+        node.target, node.args = _TENSOR[node.target], tuple(arguments)
+    graph.recompile()
+    return graph
+
+
+def _inexact(value: float) -> bool:
+    return math.isfinite(value) and torch.tensor(value, dtype=torch.float32, device="cpu").item() != value
 
 
 @Sign("export to ONNX")
@@ -110,12 +235,9 @@ def export_onnx(
         raise fail("export_onnx", "outputs", rule, twice[0])
     if len(inputs) != 1:
         raise fail("export_onnx", "inputs", "must be one name", list(inputs))
-    module = program if isinstance(program, nn.Module) else None
-    name = function_name("export_onnx", name, module)
-    if module is None:
-        assert not isinstance(program, nn.Module)
-        model = _unrolled(program, names)
-    else:
+    name = function_name("export_onnx", name, program if isinstance(program, nn.Module) else None)
+    if isinstance(program, nn.Module):
+        module = program
         if example is None:
             raise fail("export_onnx", "example", "must be given with a module: an input (B, n)", example)
         if trailing("export_onnx", "example", example, dims=2).dim() > 2 or not len(example):
@@ -123,11 +245,11 @@ def export_onnx(
         if batch is not None:
             integer("export_onnx", "batch", batch, least=1)
         check_dtype("export_onnx", module, example)
-        written = in_loops(module, example, names, batch, name)
+        written = in_loops(module, example, path, names, batch, name)
         if written is not None:
-            path.write_bytes(written.model.SerializeToString())
-            return written.source
-        model = _unrolled(trace(module, example, batch=batch), names)
+            return written
+        program = trace(module, example, batch=batch)
+    model = _unrolled(program, names)
     model.graph.name = name
     path.write_bytes(model.SerializeToString())
     return None
@@ -268,18 +390,11 @@ def as_tuple(out: Tensor | tuple[Tensor, ...]) -> tuple[Tensor, ...]:
     return (out,) if isinstance(out, Tensor) else tuple(out)
 
 
-class OnnxFile(NamedTuple):
-    """A model, and the cost of a call for a row."""
-
-    model: Any
-    source: Source
-
-
 def in_loops(
-    module: nn.Module, example: Tensor, names: Sequence[str], batch: int | None, name: str
-) -> OnnxFile | None:
-    """Return a module (B, n) -> a tensor, or a tuple of tensors (B,) and (B, m), with loops as an ONNX model;
-    None where it has none, or rows that are not alone.
+    module: nn.Module, example: Tensor, path: Path, names: Sequence[str], batch: int | None, name: str
+) -> Source | None:
+    """Write a module (B, n) -> a tensor, or a tuple of tensors (B,) and (B, m), with loops as an ONNX model,
+    and return the cost of a call; None where it has none, or rows that are not alone.
 
     ``names`` are of the input and the outputs, ``name`` that of the graph; ``batch`` are rows, None for any.
     """
@@ -289,7 +404,8 @@ def in_loops(
     if found is None:
         return None
     check_count("export_onnx", names[1:], len(found))
-    return OnnxFile(writer.model(name, names, found, example.shape[-1], batch), writer.source)
+    path.write_bytes(writer.model(name, names, found, example.shape[-1], batch).SerializeToString())
+    return writer.source
 
 
 def renamed(model: Any, names: Mapping[str, str]) -> Any:

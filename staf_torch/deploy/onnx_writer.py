@@ -8,6 +8,7 @@ Unrolled tensor operations, as `torch.onnx` writes them, take minutes of tracing
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -19,8 +20,7 @@ from ..lanes.trace.graph import FLAG, NARROW, ROW, STEP, WIDE
 from ..lanes.trace.step import Traced
 from ..lanes.tree import Tree
 from .controllers import FilteredPolicy, searches
-from .data_sheet import Source, counted
-from .graph import traced_row
+from .data_sheet import Source, counted, traced_row
 from .remembered_policy import RememberedPolicy
 
 _OPSET, _IR = 18, 8
@@ -62,17 +62,15 @@ class OnnxWriter:
         kind, ends = make.np_dtype_to_tensor_dtype(self.real), []
         for output, (value, entries) in zip(names[1:], found, strict=True):
             if entries is None:
-                self._emit("Squeeze", [value, self._constant([1], np.int64)], output)
+                self._emit("Squeeze", value, self._ints(1), name=output)
             else:
-                self._emit("Identity", [value], output)
+                self._emit("Identity", value, name=output)
             shape = [rows] if entries is None else [rows, entries]
             ends.append(make.make_tensor_value_info(output, kind, shape))
         given = make.make_tensor_value_info(names[0], kind, [rows, size])
         whole = make.make_graph(self.scopes[0][0], name, [given], ends, initializer=self.initializers)
         opset = make.make_opsetid("", _OPSET)
-        found_model = make.make_model(whole, opset_imports=[opset], producer_name="staf_torch")
-        found_model.ir_version = _IR
-        return found_model
+        return make.make_model(whole, opset_imports=[opset], producer_name="staf_torch", ir_version=_IR)
 
     # Policies.
 
@@ -102,7 +100,7 @@ class OnnxWriter:
 
     def _remembered(self, module: RememberedPolicy, x: Tensor, state: str) -> str:
         """Write the search for the nearest plans, and a loop that follows each."""
-        whole, count, states = np.int64, module.candidates + 1, len(module.first) - 1
+        count, states = module.candidates + 1, len(module.first) - 1
 
         def seen(carry: Tree, _: Tree, row: Tree) -> tuple[Tree, Tree]:
             return carry, (module.seen(row["x"]),)
@@ -111,27 +109,28 @@ class OnnxWriter:
         assert place is not None
         assert follow is not None
         ((at, _),) = self.program(place, [state])
-        apart = self._emit("Sub", [self._unsqueezed(at, 1), self._table(module.searched)])
-        far = self._emit(
-            "ReduceSum", [self._emit("Mul", [apart, apart]), self._constant([2], whole)], keepdims=0
+        apart = self._emit("Sub", self._unsqueezed(at, 1), self._table(module.searched))
+        far = self._emit("ReduceSum", self._emit("Mul", apart, apart), self._ints(2), keepdims=0)
+        places, near = self._ints(module.candidates), self._new("near")
+        self.scopes[-1][0].append(
+            self.onnx.helper.make_node("TopK", [far, places], [self._new("far"), near], largest=0)
         )
-        _, near = self._several("TopK", [far, self._constant([module.candidates], whole)], 2, largest=0)
-        near = self._emit("Mod", [near, self._constant([[states]], whole)])
-        resting = self._full(self._constant([[states]], whole))
-        chosen = self._reshaped(self._emit("Concat", [near, resting], axis=1), -1)
+        resting = self._constant([[states]], np.int64)
+        near = self._emit("Mod", near, resting)
+        chosen = self._reshaped(self._emit("Concat", near, self._full(resting), axis=1), -1)
         first, last, end = (
-            self._emit("Gather", [self._table(part), chosen])
+            self._emit("Gather", self._table(part), chosen)
             for part in (module.first, module.last, module.end)
         )
         ahead = self._emit(
-            "Add", [self._unsqueezed(first, 1), self._constant([range(module.lookahead)], whole)]
+            "Add", self._unsqueezed(first, 1), self._constant([range(module.lookahead)], np.int64)
         )
-        steps = self._emit("Min", [ahead, self._unsqueezed(last, 1)])
+        steps = self._emit("Min", ahead, self._unsqueezed(last, 1))
         width = module.lookahead * module.plans.shape[1]
-        window = self._reshaped(self._emit("Gather", [self._table(module.plans), steps]), -1, width)
-        size = self._constant([1, count, 1], whole)
-        spread = self._reshaped(self._emit("Expand", [self._unsqueezed(state, 1), size]), -1, x.shape[-1])
-        ends = self._emit("Gather", [self._table(module.models), end])
+        window = self._reshaped(self._emit("Gather", self._table(module.plans), steps), -1, width)
+        size = self._ints(1, count, 1)
+        spread = self._reshaped(self._emit("Expand", self._unsqueezed(state, 1), size), -1, x.shape[-1])
+        ends = self._emit("Gather", self._table(module.models), end)
         rows, self.rows = self.rows, self._rows_of(spread)
         before = self.source
         m = module.problem.inputs
@@ -139,10 +138,10 @@ class OnnxWriter:
         one = Source(*(b - a for a, b in zip(before, self.source, strict=True)))
         self.rows = rows
         self.source = Source(*(a + b for a, b in zip(before, module.source(one), strict=True)))
-        best = self._emit("ArgMin", [self._reshaped(cost, -1, count)], axis=1, keepdims=1)
-        wide = self._emit("Expand", [self._unsqueezed(best, 2), self._constant([1, 1, m], whole)])
-        found = self._emit("GatherElements", [self._reshaped(control, -1, count, m), wide], axis=1)
-        return self._emit("Squeeze", [found, self._constant([1], whole)])
+        best = self._emit("ArgMin", self._reshaped(cost, -1, count), axis=1, keepdims=1)
+        wide = self._emit("Expand", self._unsqueezed(best, 2), self._ints(1, 1, m))
+        found = self._emit("GatherElements", self._reshaped(control, -1, count, m), wide, axis=1)
+        return self._emit("Squeeze", found, self._ints(1))
 
     def program(self, traced: Traced, inputs: Sequence[str]) -> list[tuple[str, int | None]]:
         """Write a program of a row: the names of its outputs (B, size), and their entries."""
@@ -155,15 +154,16 @@ class OnnxWriter:
             self._statement(node)
         nodes, found = iter(ends), list[tuple[str, int | None]]()
         for shape, _ in traced.outputs:
-            parts = [self._put(next(nodes)) for _ in range(shape[0] if shape else 1)]
-            found.append((self._emit("Concat", parts, axis=1), shape[0] if shape else None))
+            values = [self._ref(node) for node in itertools.islice(nodes, shape[0] if shape else 1)]
+            parts = [self._full(self._cast(value, self.real)) for value in values]
+            found.append((self._emit("Concat", *parts, axis=1), shape[0] if shape else None))
         self.source = Source(*(a + b for a, b in zip(self.source, counted(traced), strict=True)))
         return found
 
     def _rows_of(self, value: str) -> str:
         """Return the shape (B, 1)."""
-        count = self._emit("Shape", [value], end=1)
-        return self._emit("Concat", [count, self._constant([1], np.int64)], axis=0)
+        count = self._emit("Shape", value, end=1)
+        return self._emit("Concat", count, self._ints(1), axis=0)
 
     def _table(self, values: Tensor) -> str:
         """Return a table, as it is."""
@@ -172,20 +172,13 @@ class OnnxWriter:
         return name
 
     def _unsqueezed(self, value: str, axis: int) -> str:
-        return self._emit("Unsqueeze", [value, self._constant([axis], np.int64)])
+        return self._emit("Unsqueeze", value, self._ints(axis))
 
     def _reshaped(self, value: str, *shape: int) -> str:
-        return self._emit("Reshape", [value, self._constant(shape, np.int64)])
+        return self._emit("Reshape", value, self._ints(*shape))
 
-    def _several(self, op: str, inputs: Sequence[str], count: int, **attributes: Any) -> list[str]:
-        names = [self._new(op) for _ in range(count)]
-        self.scopes[-1][0].append(self.onnx.helper.make_node(op, list(inputs), names, **attributes))
-        return names
-
-    def _put(self, node: int) -> str:
-        """Return a number of an output, with all rows and in the dtype of the program."""
-        value = self._ref(node)
-        return self._full(value if self._dtype(node) == self.real else self._cast(value, self.real))
+    def _ints(self, *values: int) -> str:
+        return self._constant(values, np.int64)
 
     # Values.
 
@@ -193,7 +186,7 @@ class OnnxWriter:
         self.count += 1
         return f"_{kind}_{self.count}"
 
-    def _emit(self, op: str, inputs: Sequence[str], name: str | None = None, **attributes: Any) -> str:
+    def _emit(self, op: str, *inputs: str, name: str | None = None, **attributes: Any) -> str:
         """Add an operation; it has one row if all of its inputs have."""
         name = self._new(op) if name is None else name
         node = self.onnx.helper.make_node(op, list(inputs), [name], **attributes)
@@ -217,27 +210,22 @@ class OnnxWriter:
         return known.get(kind, self.real)
 
     def _cast(self, value: str, dtype: Any) -> str:
-        return self._emit("Cast", [value], to=self.onnx.helper.np_dtype_to_tensor_dtype(np.dtype(dtype)))
+        return self._emit("Cast", value, to=self.onnx.helper.np_dtype_to_tensor_dtype(np.dtype(dtype)))
 
     def _full(self, value: str) -> str:
         """Return a value with all rows."""
         if value not in self.single:
             return value
-        full = self._emit("Expand", [value, self.rows])
+        full = self._emit("Expand", value, self.rows)
         self.single.discard(full)
         return full
 
-    def _known(self, node: int) -> str | None:
-        return next((names[node] for _, names in reversed(self.scopes) if node in names), None)
-
     def _ref(self, node: int) -> str:
         """Return the value of a number or an array, written where nobody has read it before."""
-        known = self._known(node)
-        if known is not None:
-            return known
-        name = self._value(node)
-        self.scopes[-1][1][node] = name
-        return name
+        known = next((names[node] for _, names in reversed(self.scopes) if node in names), None)
+        if known is None:
+            known = self.scopes[-1][1][node] = self._value(node)
+        return known
 
     def _value(self, node: int) -> str:
         graph, op, aux = self.graph, self.graph.op[node], self.graph.aux[node]
@@ -251,14 +239,9 @@ class OnnxWriter:
             return self._packed(graph.args[node])
         if op == "load":
             number, at, stride = aux
-            step = self._constant(stride, np.int64)
-            place = self._emit(
-                "Add", [self._emit("Mul", [f"_i{self.part}_{number}", step]), self._constant(at, np.int64)]
-            )
+            turned = self._emit("Mul", f"_i{self.part}_{number}", self._ints(stride))
             array = self._ref(graph.args[node][0])
-            found = self._emit(
-                "Gather", [array, self._emit("Unsqueeze", [place, self._constant([0], np.int64)])], axis=1
-            )
+            found = self._emit("Gather", array, self._emit("Add", turned, self._ints(at)), axis=1)
             return self._marked(found, array in self.single)
         if op in ("map", "dot"):
             return self._map(node) if op == "map" else self._dot(node)
@@ -271,7 +254,7 @@ class OnnxWriter:
         return name
 
     def _take(self, array: str, places: Sequence[int]) -> str:
-        return self._emit("Gather", [array, self._constant(list(places), np.int64)], axis=1)
+        return self._emit("Gather", array, self._ints(*places), axis=1)
 
     def _packed(self, nodes: Sequence[int]) -> str:
         graph = self.graph
@@ -280,7 +263,7 @@ class OnnxWriter:
         values = [self._ref(node) for node in nodes]
         if not all(value in self.single for value in values):
             values = [self._full(value) for value in values]
-        return self._emit("Concat", values, axis=1)
+        return self._emit("Concat", *values, axis=1)
 
     def _map(self, node: int) -> str:
         op, shape, *places = self.graph.aux[node]
@@ -289,11 +272,11 @@ class OnnxWriter:
             value = self._ref(operand)
             values.append(value if place is None else self._take(value, place))
         if op == "copy":
-            return self._emit("Identity", values)
+            return self._emit("Identity", *values)
         found = self._operation(op, values, node)
         if all(place is None for place in places):
-            size = self._constant([1, int(np.prod(shape))], np.int64)
-            return self._marked(self._emit("Expand", [found, size]), found in self.single)
+            size = self._ints(1, int(np.prod(shape)))
+            return self._marked(self._emit("Expand", found, size), found in self.single)
         return found
 
     def _dot(self, node: int) -> str:
@@ -301,89 +284,88 @@ class OnnxWriter:
         values = []
         for operand, place in zip(self.graph.args[node], places, strict=True):
             value = self._ref(operand)
-            if place is not None:
-                shape = self._constant([-1, outs, count], np.int64)
-                value = self._emit("Reshape", [self._take(value, place), shape])
-            else:
-                value = self._emit("Unsqueeze", [value, self._constant([2], np.int64)])
-            values.append(value)
-        product = self._emit("Mul", values)
-        return self._emit("ReduceSum", [product, self._constant([2], np.int64)], keepdims=0)
+            values.append(
+                self._unsqueezed(value, 2)
+                if place is None
+                else self._reshaped(self._take(value, place), -1, outs, count)
+            )
+        product = self._emit("Mul", *values)
+        return self._emit("ReduceSum", product, self._ints(2), keepdims=0)
 
     # Operations.
 
     def _operation(self, op: str, values: Sequence[str], node: int) -> str:
         if op in _BINARY or op in _UNARY:
-            return self._emit(_BINARY.get(op) or _UNARY[op], values)
+            return self._emit(_BINARY.get(op) or _UNARY[op], *values)
         if op == "where" and self.graph.type[node] == FLAG:  # of flags onnxruntime has no choice
             chosen, a, b = values
-            other = self._emit("And", [self._emit("Not", [chosen]), b])
-            return self._emit("Or", [self._emit("And", [chosen, a]), other])
+            other = self._emit("And", self._emit("Not", chosen), b)
+            return self._emit("Or", self._emit("And", chosen, a), other)
         if op == "where":
             return self._where(*values)
         if op == "ne":
-            return self._emit("Not", [self._emit("Equal", values)])
+            return self._emit("Not", self._emit("Equal", *values))
         if op == "cast":
             return self._cast(values[0], self._dtype(node))
         if op in ("min", "max"):  # NaN wins
             a, b = values
-            first = self._emit("Less", [a, b] if op == "min" else [b, a])
-            return self._where(self._emit("Or", [first, self._emit("IsNaN", [a])]), a, b)
+            first = self._emit("Less", *((a, b) if op == "min" else (b, a)))
+            return self._where(self._emit("Or", first, self._emit("IsNaN", a)), a, b)
         written: Callable[..., str] = getattr(self, f"_{op}")
         return written(*values, self._dtype(node))
 
     def _where(self, chosen: str, a: str, b: str) -> str:
-        return self._emit("Where", [chosen, a, b])
+        return self._emit("Where", chosen, a, b)
 
     def _tan(self, x: str, dtype: Any) -> str:
-        return self._emit("Div", [self._emit("Sin", [x]), self._emit("Cos", [x])])
+        return self._emit("Div", self._emit("Sin", x), self._emit("Cos", x))
 
     def _trunc(self, x: str, dtype: Any) -> str:
-        below = self._emit("Less", [x, self._constant([[0]], dtype)])
-        return self._where(below, self._emit("Ceil", [x]), self._emit("Floor", [x]))
+        below = self._emit("Less", x, self._constant([[0]], dtype))
+        return self._where(below, self._emit("Ceil", x), self._emit("Floor", x))
 
     def _expm1(self, x: str, dtype: Any) -> str:
         """Kahan's (e^x - 1) x / log(e^x), which keeps the digits of a small x."""
-        one, power = self._constant([[1]], dtype), self._emit("Exp", [x])
-        less = self._emit("Sub", [power, one])
-        exact = self._emit("Div", [self._emit("Mul", [less, x]), self._emit("Log", [power])])
-        ends = self._emit("Or", [self._emit("IsInf", [each]) for each in (self._emit("Log", [power]), power)])
-        return self._where(self._emit("Equal", [power, one]), x, self._where(ends, less, exact))
+        one, power = self._constant([[1]], dtype), self._emit("Exp", x)
+        less = self._emit("Sub", power, one)
+        exact = self._emit("Div", self._emit("Mul", less, x), self._emit("Log", power))
+        ends = self._emit("Or", *[self._emit("IsInf", each) for each in (self._emit("Log", power), power)])
+        return self._where(self._emit("Equal", power, one), x, self._where(ends, less, exact))
 
     def _log1p(self, x: str, dtype: Any) -> str:
         """Kahan's log(1 + x) x / ((1 + x) - 1)."""
         one = self._constant([[1]], dtype)
-        more = self._emit("Add", [x, one])
-        log = self._emit("Log", [more])
-        exact = self._emit("Div", [self._emit("Mul", [log, x]), self._emit("Sub", [more, one])])
-        ends = self._emit("IsInf", [log])
-        return self._where(self._emit("Equal", [more, one]), x, self._where(ends, log, exact))
+        more = self._emit("Add", x, one)
+        log = self._emit("Log", more)
+        exact = self._emit("Div", self._emit("Mul", log, x), self._emit("Sub", more, one))
+        ends = self._emit("IsInf", log)
+        return self._where(self._emit("Equal", more, one), x, self._where(ends, log, exact))
 
     def _atan2(self, y: str, x: str, dtype: Any) -> str:
         """The angle by Atan in float32, all that onnxruntime has, and what a rotation by it leaves."""
         single = np.float32
         zero = self._constant([[0]], dtype)
-        steep = self._emit("Less", [self._emit("Abs", [x]), self._emit("Abs", [y])])
-        none = self._emit("And", [self._emit("Equal", [x, zero]), self._emit("Equal", [y, zero])])
+        steep = self._emit("Less", self._emit("Abs", x), self._emit("Abs", y))
+        none = self._emit("And", self._emit("Equal", x, zero), self._emit("Equal", y, zero))
         low = self._where(none, self._constant([[1]], dtype), self._where(steep, y, x))
-        ratio = self._emit("Div", [self._where(steep, x, y), low])
-        rough = self._cast(self._emit("Atan", [self._cast(ratio, single)]), dtype)
+        ratio = self._emit("Div", self._where(steep, x, y), low)
+        rough = self._cast(self._emit("Atan", self._cast(ratio, single)), dtype)
         half = self._constant([[np.pi / 2]], dtype)
-        turned = self._where(self._negative(y, dtype), self._emit("Neg", [half]), half)
-        flat = self._where(self._negative(x, dtype), self._emit("Add", [turned, turned]), zero)
-        angle = self._where(steep, self._emit("Sub", [turned, rough]), self._emit("Add", [flat, rough]))
-        sin, cos = self._emit("Sin", [angle]), self._emit("Cos", [angle])
-        across = self._emit("Sub", [self._emit("Mul", [y, cos]), self._emit("Mul", [x, sin])])
-        along = self._emit("Add", [self._emit("Mul", [x, cos]), self._emit("Mul", [y, sin])])
-        left = self._emit("Div", [across, self._where(none, self._constant([[1]], dtype), along)])
-        far = self._emit("IsInf", [self._emit("Add", [self._emit("Abs", [x]), self._emit("Abs", [y])])])
-        return self._where(far, angle, self._emit("Add", [angle, left]))
+        turned = self._where(self._negative(y, dtype), self._emit("Neg", half), half)
+        flat = self._where(self._negative(x, dtype), self._emit("Add", turned, turned), zero)
+        angle = self._where(steep, self._emit("Sub", turned, rough), self._emit("Add", flat, rough))
+        sin, cos = self._emit("Sin", angle), self._emit("Cos", angle)
+        across = self._emit("Sub", self._emit("Mul", y, cos), self._emit("Mul", x, sin))
+        along = self._emit("Add", self._emit("Mul", x, cos), self._emit("Mul", y, sin))
+        left = self._emit("Div", across, self._where(none, self._constant([[1]], dtype), along))
+        far = self._emit("IsInf", self._emit("Add", self._emit("Abs", x), self._emit("Abs", y)))
+        return self._where(far, angle, self._emit("Add", angle, left))
 
     def _negative(self, x: str, dtype: Any) -> str:
         """Return whether a number is below 0, or -0."""
         zero = self._constant([[0]], dtype)
-        inverse = self._emit("Div", [self._constant([[1]], dtype), x])
-        return self._emit("Or", [self._emit("Less", [x, zero]), self._emit("Less", [inverse, zero])])
+        inverse = self._emit("Div", self._constant([[1]], dtype), x)
+        return self._emit("Or", self._emit("Less", x, zero), self._emit("Less", inverse, zero))
 
     # Loops.
 
@@ -403,8 +385,8 @@ class OnnxWriter:
         for node in self.schedule.body(number):
             self._statement(node)
         going = self._going(loop.going)
-        after = [self._emit("Identity", [self._full(self._ref(loop.following[k]))]) for k in live]
-        put = [self._emit("Identity", [self._full(self._packed(loop.collected[k]))]) for k in kept]
+        after = [self._emit("Identity", self._full(self._ref(loop.following[k]))) for k in live]
+        put = [self._emit("Identity", self._full(self._packed(loop.collected[k]))) for k in kept]
         statements, _ = self.scopes.pop()
         flag, index = self.onnx.TensorProto.BOOL, self.onnx.TensorProto.INT64
         begins = [make.make_tensor_value_info(f"_i{self.part}_{number}", index, [])]
@@ -423,16 +405,16 @@ class OnnxWriter:
         self.scopes[-1][0].append(make.make_node("Loop", given, [*results, *stacked], body=body))
         self.results |= {("result", number, k): name for k, name in zip(live, results, strict=True)}
         for k, name in zip(kept, stacked, strict=True):
-            flat = self._emit("Transpose", [name], perm=[1, 0, 2])
-            shape = self._constant([-1, loop.count * len(loop.collected[k])], np.int64)
-            self.results["collect", number, k] = self._emit("Reshape", [flat, shape])
+            flat = self._emit("Transpose", name, perm=[1, 0, 2])
+            shape = self._ints(-1, loop.count * len(loop.collected[k]))
+            self.results["collect", number, k] = self._emit("Reshape", flat, shape)
 
     def _going(self, node: int) -> str:
         """Return whether any row took this pass: none takes another one then."""
         if node < 0:
-            return self._emit("Identity", [self._constant(True, bool)])
+            return self._emit("Identity", self._constant(True, bool))
         taken = self._cast(self._ref(node), np.int32)
-        return self._cast(self._emit("ReduceMax", [taken], keepdims=0), bool)
+        return self._cast(self._emit("ReduceMax", taken, keepdims=0), bool)
 
     def _info(self, name: str, node: int, size: int | None = None) -> Any:
         make, kind = self.onnx.helper, self._dtype(node)
