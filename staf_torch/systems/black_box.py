@@ -13,7 +13,6 @@ from torch import Tensor
 from ..lanes.gradients import defer_gradient, jacrev, marked
 from ..numerics.derivatives import Apart, central_slopes
 from .base import Linearisation
-from .numpy_in_torch import InTorch, agrees
 
 Motion = Callable[..., Any]
 """(x (B, n), u (B, m)) -> (B, n), of torch tensors or of NumPy arrays."""
@@ -210,3 +209,151 @@ def _same(pushed: Callable[[float], tuple[Any, Tensor]], size: float) -> bool:
 def _shown(error: Exception) -> str:
     """Kind and first line of an error."""
     return f"{type(error).__name__} ({str(error).splitlines()[0] if str(error) else ''})"
+
+
+def _torch(value: Any) -> Any:
+    """Return tensors in the place of arrays; all else as it is."""
+    if isinstance(value, TensorArray):
+        return value.tensor
+    if isinstance(value, np.ndarray):
+        dtype = torch.bool if value.dtype == bool else torch.float64
+        return torch.as_tensor(value, dtype=dtype, device="cpu")
+    return type(value)(map(_torch, value)) if isinstance(value, list | tuple) else value
+
+
+def _number(value: Any) -> Any:
+    """Return `_torch`, and a tensor in the place of a number."""
+    return _torch(value) if isinstance(value, TensorArray | np.ndarray) else _wide(value)
+
+
+def _power(x: Tensor, exponent: Tensor) -> Tensor:
+    """x ** p, with p a number where it is one: its derivative has no logarithm."""
+    return x ** (exponent.item() if exponent.dim() == 0 and not exponent.requires_grad else exponent)
+
+
+def _clip(x: Tensor, min: Any = None, max: Any = None) -> Tensor:
+    x = x if min is None else torch.maximum(x, _wide(min))
+    return x if max is None else torch.minimum(x, _wide(max))
+
+
+def _wide(value: Any) -> Tensor:
+    return torch.as_tensor(value, dtype=torch.float64, device=getattr(value, "device", "cpu"))
+
+
+_SAME = (
+    *("add", "subtract", "multiply", "divide", "negative", "positive", "absolute", "sign", "square", "sqrt"),
+    *("exp", "expm1", "exp2", "log", "log1p", "log2", "log10", "sin", "cos", "tan", "sinh", "cosh", "tanh"),
+    *("arcsin", "arccos", "arctan", "arcsinh", "arccosh", "arctanh", "arctan2", "hypot", "floor", "ceil"),
+    *("trunc", "remainder", "fmod", "reciprocal", "maximum", "minimum", "greater", "greater_equal", "less"),
+    *("less_equal", "not_equal", "logical_and", "logical_or", "logical_not", "isfinite", "isnan", "copysign"),
+    *("deg2rad", "rad2deg", "matmul", "heaviside", "true_divide", "fmax", "fmin", "stack", "sinc"),
+    *("column_stack", "hstack", "vstack", "sum", "mean", "zeros_like", "ones_like", "einsum"),
+    *("squeeze", "reshape", "round", "atleast_2d", "broadcast_to"),
+)
+_FUNCTIONS: dict[str, Callable[..., Any]] = {
+    **{name: getattr(torch, name) for name in _SAME},
+    **{"power": _power, "float_power": _power, "rint": torch.round, "fabs": torch.abs, "equal": torch.eq},
+    **{"clip": _clip, "where": lambda c, a, b: torch.where(c, _wide(a), _wide(b)), "copy": torch.clone},
+    **{
+        "concatenate": torch.cat,
+        "dot": torch.matmul,
+        "expand_dims": torch.unsqueeze,
+        "empty_like": torch.zeros_like,
+    },
+    **{"full_like": lambda x, value: torch.zeros_like(x) + value, "transpose": lambda x: x.mT},
+}
+_ARGUMENTS = {"axis": "dim", "keepdims": "keepdim", "a_min": "min", "a_max": "max"}
+"""Arguments of NumPy: those of torch."""
+
+
+class TensorArray(np.lib.mixins.NDArrayOperatorsMixin):
+    """A tensor in the place of an array of float64: NumPy calls back for operations on what is no array.
+
+    Its protocols for other arrays (NEP 13, ``__array_ufunc__``, and NEP 18, ``__array_function__``) do so for
+    every operation on an object that has them, and each is done with torch. So a simulator as
+    ``np.stack((x[:, 0] + dt * x[:, 1], np.sin(x[:, 0]) + u[:, 0]), axis=1)`` has derivatives and is compiled,
+    in place of differences and a call a step. What NumPy makes by itself (``np.array([x[:, 0], ...])``),
+    branches on values, and functions that are not listed above raise TypeError: such a function stays a
+    black box.
+    """
+
+    def __init__(self, tensor: Tensor) -> None:
+        self.tensor = tensor
+
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *given: Any, **more: Any) -> Any:
+        function = _FUNCTIONS.get(ufunc.__name__)
+        if function is None or method != "__call__" or more:
+            return NotImplemented
+        return TensorArray(function(*map(_number, given)))
+
+    def __array_function__(
+        self, func: Callable[..., Any], types: Any, args: Any, given: dict[str, Any]
+    ) -> Any:
+        function = _FUNCTIONS.get(func.__name__)
+        if function is None:
+            return NotImplemented
+        named = {_ARGUMENTS.get(name, name): _torch(part) for name, part in given.items()}
+        return TensorArray(function(*map(_torch, args), **named))
+
+    def __array__(self, *given: Any, **more: Any) -> Any:
+        raise TypeError("a tensor that is followed is no array")
+
+    def __bool__(self) -> bool:
+        raise TypeError("a branch on a value")
+
+    def __getitem__(self, key: Any) -> TensorArray:
+        return TensorArray(self.tensor[_key(key)])
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        tensor = self.tensor.clone()
+        tensor[_key(key)] = _torch(value)
+        self.tensor = tensor
+
+    def __len__(self) -> int:
+        return len(self.tensor)
+
+    def __getattr__(self, name: str) -> Any:
+        """Shape and methods of an array, as far as they have a function above."""
+        if name in ("shape", "ndim"):
+            return getattr(self.tensor, name)
+        if name == "T":
+            return TensorArray(self.tensor.permute(*range(self.tensor.dim() - 1, -1, -1)))
+        if name == "astype":
+            return lambda *given, **more: self
+        if name == "dtype":
+            return np.dtype(np.float64)
+        if name in ("copy", "sum", "mean", "clip", "dot", "round", "squeeze"):
+            return lambda *given, **more: self.__array_function__(getattr(np, name), (), (self, *given), more)
+        if name == "reshape":
+            return lambda *shape: TensorArray(self.tensor.reshape(*shape))
+        raise AttributeError(name)
+
+
+def _key(key: Any) -> Any:
+    return tuple(_key(part) for part in key) if isinstance(key, tuple) else getattr(key, "tensor", key)
+
+
+class InTorch:
+    """A function of arrays x (B, n) and u (B, m), written in NumPy, of tensors."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.function = function
+
+    def __call__(self, x: Tensor, u: Tensor) -> Tensor:
+        """(B, n), (B, m) -> (B, n)."""
+        after = self.function(TensorArray(x), TensorArray(u))
+        if not isinstance(after, TensorArray):
+            raise TypeError(f"the function returns {type(after).__name__}")
+        return after.tensor
+
+
+def agrees(function: Callable[..., Any], x: Tensor, u: Tensor) -> bool:
+    """Return whether a function in NumPy is the same in torch at states x (B, n) and inputs u (B, m)."""
+    try:
+        with torch.no_grad():
+            found = InTorch(function)(x, u)
+        wanted = torch.as_tensor(np.asarray(function(x.numpy(), u.numpy()), dtype=np.float64), device="cpu")
+    except Exception:  # it is a black box then
+        return False
+    scale = 1 + wanted.abs()
+    return found.shape == wanted.shape and bool(((found - wanted).abs() <= 1e-12 * scale).all())
