@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import math
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -28,73 +27,48 @@ _REALS = {torch.float32: "float", torch.float64: "double"}
 _MOST = 66  # centers: beyond, unrolled loops and a stack frame of M^2 vectors no longer pay
 
 
-class FunctionPointers(ctypes.Structure):
-    """`Functions` of _filter.hpp."""
-
-    _fields_ = (
-        ("offsets", ctypes.c_void_p),
-        ("squares", ctypes.c_void_p),
-        ("newton", ctypes.c_void_p),
-        ("gram", ctypes.c_void_p),
-        ("rate", ctypes.c_double),
-        ("reach", ctypes.c_double),
-    )
-
-    @classmethod
-    def of(cls, functions: LocalFunctions) -> tuple[FunctionPointers, list[Tensor]]:
-        """The pointers, and the tensors that must live as long."""
-        assert functions.shared is not None
-        assert functions.rate is not None
-        # C = P'L^-T is upper triangular in the order of the pivots, in which compiled code has the centers
-        leading = (functions.shared == 0).long().cumprod(1).sum(1)
-        order = leading.argsort()
-        newton, offsets = functions.shared[order].contiguous(), functions.offsets.double()[order].contiguous()
-        assert not newton.tril(-1).any()
-        zero = torch.zeros_like(offsets[0])
-        gram = functions.kernel.core(zero, offsets, offsets).contiguous()
-        held = [offsets, offsets.square().sum(-1), newton, gram]
-        reach = math.sqrt(max(float(offsets.square().sum(-1).amax()), 1e-300))
-        pointers = [tensor.data_ptr() for tensor in held]
-        return cls(*pointers, float(functions.rate), reach), held
-
-
 class StreamsInC(ctypes.Structure):
     """`Streams` of _filter.cpp."""
 
     _fields_ = (
-        ("streams", ctypes.c_int64),
-        ("stride", ctypes.c_int64),
-        ("closed", ctypes.c_int64),
+        *((name, ctypes.c_int64) for name in ("streams", "stride", "closed")),
         *((name, ctypes.c_void_p) for name in ("table", "counts", "ratio", "forgetting")),
-        ("functions", FunctionPointers),
-        *((name, ctypes.c_double) for name in ("slack2", "robust", "base", "tiny", "most")),
-    )
-
-
-class OwnStreamsInC(ctypes.Structure):
-    """`Streams` of _filter.cpp with numbers of a stream's own."""
-
-    _fields_ = (
-        ("streams", ctypes.c_int64),
-        ("stride", ctypes.c_int64),
-        ("closed", ctypes.c_int64),
-        *((name, ctypes.c_void_p) for name in ("table", "counts", "ratio", "forgetting")),
-        *((name, ctypes.c_void_p) for name in ("offsets", "squares", "newton", "gram")),
-        *((name, ctypes.c_void_p) for name in ("rate", "reach", "slack2", "robust", "base")),
+        *((name, ctypes.c_void_p) for name in ("offsets", "squares", "newton", "gram", "rate", "reach")),
+        *((name, ctypes.c_void_p) for name in ("slack2", "robust", "size")),
         *((name, ctypes.c_double) for name in ("tiny", "most")),
     )
 
 
-def _own_columns(definition: LocalFilter, functions: OwnFunctions) -> list[Tensor]:
-    """Return numbers of all streams as _filter.cpp reads them: (blocks, numbers, `LANES`)."""
-    squares = functions.offsets.square().sum(1)
-    reach = squares.amax(0).clamp(min=1e-300).sqrt()
-    law = (definition.slack, definition.robust, definition.base)
-    slack, robust, base = (torch.as_tensor(part, device="cpu").double().expand_as(reach) for part in law)
-    parts = (functions.offsets, squares, functions.shared, functions.gram, functions.rate, reach)
+def functions_in_c(functions: LocalFunctions | OwnFunctions) -> list[Tensor]:
+    """Return `Functions` of _filter.hpp: d, |d|^2, C, K0, q and the largest |d|."""
+    if isinstance(functions, OwnFunctions):
+        squares = functions.offsets.square().sum(1)
+        reach = squares.amax(0).clamp(min=1e-300).sqrt()
+        return [functions.offsets, squares, functions.shared, functions.gram, functions.rate, reach]
+    assert functions.shared is not None
+    assert functions.rate is not None
+    # C = P'L^-T is upper triangular in the order of the pivots, in which compiled code has the centers
+    order = (functions.shared == 0).long().cumprod(1).sum(1).argsort()
+    newton, offsets = functions.shared[order].contiguous(), functions.offsets.double()[order].contiguous()
+    assert not newton.tril(-1).any()
+    gram = functions.kernel.core(torch.zeros_like(offsets[0]), offsets, offsets).contiguous()
+    squares = offsets.square().sum(-1)
+    return [offsets, squares, newton, gram, functions.rate.double(), squares.amax().clamp(min=1e-300).sqrt()]
+
+
+def _numbers_of(definition: LocalFilter) -> list[Tensor]:
+    """Return numbers as _filter.cpp reads them: of all streams alike, or (blocks, numbers, `LANES`)."""
+    slack, *law = (
+        torch.as_tensor(part, device="cpu").double()
+        for part in (definition.slack, definition.robust, definition.base)
+    )
+    parts = [*functions_in_c(definition.functions), slack.square(), law[0], law[1].sqrt()]
+    if not isinstance(definition.functions, OwnFunctions):
+        return parts
+    streams = len(definition.functions.rate)
     return [
-        blocks_of(part.reshape(-1, len(reach)), padding=1.0)
-        for part in (*parts, slack.square(), robust, base)
+        blocks_of((part if part.dim() else part.expand(streams)).reshape(-1, streams), padding=1.0)
+        for part in parts
     ]
 
 
@@ -108,22 +82,10 @@ class CompiledFilter:
 
     def __init__(self, definition: LocalFilter, state: StreamState, call: Callable[..., None]) -> None:
         ratio, forgetting = definition.ratio.contiguous(), definition.forgetting.contiguous()
-        self._held = [state.blocks, state.counts, ratio, forgetting]
-        streams, functions = state.streams, definition.functions
-        numbers = torch.finfo(state.dtype)
-        places = [each.data_ptr() for each in self._held]
-        limits = numbers.eps**0.5, numbers.max
-        self._streams: StreamsInC | OwnStreamsInC
-        if isinstance(functions, OwnFunctions):
-            own = _own_columns(definition, functions)
-            self._held += own
-            columns = [each.data_ptr() for each in own]
-            self._streams = OwnStreamsInC(streams, streams, 0, *places, *columns, *limits)
-        else:
-            pointers, held = FunctionPointers.of(functions)
-            self._held += held
-            law = float(definition.slack) ** 2, float(definition.robust), float(definition.base)
-            self._streams = StreamsInC(streams, streams, 0, *places, pointers, *law, *limits)
+        self._held = [state.blocks, state.counts, ratio, forgetting, *_numbers_of(definition)]
+        streams, real = state.streams, torch.finfo(state.dtype)
+        places = (each.data_ptr() for each in self._held)
+        self._streams = StreamsInC(streams, streams, 0, *places, real.eps**0.5, real.max)
         self._run, self.reference = call, ctypes.addressof(self._streams)
         # the same function, called without giving Python's lock away
         address = ctypes.cast(call, ctypes.c_void_p).value  # type: ignore[arg-type]
@@ -185,14 +147,6 @@ class DirectCalls:
         self.filter, self._dtype, self._shape, self._targets = filter_, dtype, shape, targets
         self._run, self._reference = filter_.holding, filter_.reference
         self._like = torch.empty(targets, dtype=dtype, device="cpu")  # whose form results have, quicker so
-
-    def close(self) -> None:
-        """Do nothing from now on."""
-        self.filter.close(True)
-
-    def reopen(self) -> None:
-        """Go on."""
-        self.filter.close(False)
 
     def learn(self, x: Any, y: Any) -> bool:
         """Learn one sample a stream; False where it does not fit, or the streams are just changed."""

@@ -20,9 +20,9 @@ from ..numerics.checks import fail, integer, trailing
 from ..numerics.default_device import beside, on
 from ..signs import Sign
 from .compiled_filter import DirectCalls
+from .filter_streams import Streams
 from .samples import in_place, lapse_of, lapses, like_given, pair, single, tensor_of
 from .scikit_estimator import NotFittedError, ScikitEstimator, parameters, told_kernel
-from .streams import Streams
 
 _ABOUT = ("n_features_in_", "n_streams_", "n_outputs_")
 _DTYPES = {str(dtype): dtype for dtype in (torch.float32, torch.float64)}
@@ -196,12 +196,12 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         if direct is None:
             function(*given)
             return
-        direct.close()
+        direct.filter.close(True)
         try:
             function(*given)
         finally:
             if self._direct_ is direct:  # else its streams are no longer these
-                direct.reopen()
+                direct.filter.close(False)
 
     def _predict(self, x: Any, return_std: bool) -> Any:
         if not seen_by_others() and in_place(x, self._in_place_, self._shape_):

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
+from ..numerics.angles import turned
 from .compiled_filter import CompiledFilter, DirectCalls
 from .filter_program import KernelFilter
 from .kalman_filter import STREAK, LocalFilter
@@ -20,7 +21,38 @@ GROWN = 3.0  # times its unit: a coordinate whose latest samples spread so far g
 LOOKED_AT = 10  # samples after which that is looked at again
 
 
-class FilterStreams:
+class Streams(Protocol):
+    """Streams side by side, none of which influences another: `FilterStreams`, or the `Bank` of a mixture."""
+
+    dtype: torch.dtype
+    compiled: bool  # tensors of this dtype are read in place by compiled code
+    moves: bool  # samples of any device to where the streams are, and what is predicted back
+
+    @property
+    def count(self) -> int: ...  # S
+    @property
+    def learned(self) -> Tensor: ...  # samples, (S,) int64
+    @property
+    def skipped(self) -> Tensor: ...
+    def predict(  # mean and deviation of the next y at x (S, n), in a shape
+        self, x: Tensor, shape: tuple[int, ...] | None = None
+    ) -> tuple[Tensor, Tensor]: ...
+    def learn(self, x: Tensor, y: Tensor, lapse: Tensor | None = None) -> None: ...
+    def clear(self, rows: Tensor) -> None: ...  # these streams begin anew
+    def add(self, streams: int) -> None: ...  # behind the others
+    def keep(self, rows: Tensor) -> None: ...  # these alone
+    def state_dict(self) -> dict[str, Tensor]: ...
+    def load_state_dict(self, state: dict[str, Tensor]) -> None: ...
+    def stretch(self, x: Tensor, y: Tensor, lapse: Tensor) -> bool:
+        """Learn a stretch in one call, (T, S, n), (T, S, K), (T, S); False where it is sample by sample."""
+        return False
+
+    def direct(self, shape: tuple[int, ...], targets: tuple[int, ...]) -> DirectCalls | None:
+        """Return the calls that need no lock, of samples of these shapes; None where there are none."""
+        return None
+
+
+class FilterStreams(Streams):
     """S streams that a `LocalFilter` filters, in their own units where these are learned.
 
     Args:
@@ -31,6 +63,8 @@ class FilterStreams:
         stretch: by which learned spreads are multiplied, (S, n + K), ones by default.
         may_grow: 1 for coordinates whose units grow with what they are seen to move by, (S, n); by default
             all where units are learned, none where they are known.
+        periodic: coordinates of x, angles in rad, that are turned by whole turns to within pi of the latest.
+            The centers follow the latest x: what was learned a turn before was forgotten when they left it.
     """
 
     moves = False
@@ -43,7 +77,10 @@ class FilterStreams:
         units: Tensor | None = None,
         stretch: Tensor | None = None,
         may_grow: Tensor | None = None,
+        periodic: tuple[int, ...] = (),
     ) -> None:
+        self.periodic = periodic
+        self.latest = state.blocks.new_full((state.streams, state.dim), torch.nan)
         self.scaling = scaling
         self.dtype = state.dtype
         size, wide = state.streams, state.dim + state.outputs
@@ -79,8 +116,12 @@ class FilterStreams:
         self._calm, self._even = False, 0  # until `_see`
 
     def direct(self, shape: tuple[int, ...], targets: tuple[int, ...]) -> DirectCalls | None:
-        """Return the calls that need no lock, of samples of these shapes; None where there are none."""
-        if self.scaling or not isinstance(self._filter, CompiledFilter) or not self._filter.short:
+        if (
+            self.scaling
+            or self.periodic
+            or not isinstance(self._filter, CompiledFilter)
+            or not self._filter.short
+        ):
             return None
         return DirectCalls(self._filter, self.dtype, shape, targets)
 
@@ -101,6 +142,7 @@ class FilterStreams:
 
     def predict(self, x: Tensor, shape: tuple[int, ...] | None = None) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of the next y at x (S, n): (S, K), or in ``shape``."""
+        x = self._near(x)
         if not self.scaling:
             if isinstance(self._filter, CompiledFilter):
                 return self._filter.predict(self.state, x, shape)
@@ -111,17 +153,23 @@ class FilterStreams:
         return mean * self._spread[:, n:] + self._center[:, n:], deviation * self._spread[:, n:]
 
     def stretch(self, x: Tensor, y: Tensor, lapse: Tensor) -> bool:
-        """Learn a stretch in one call, (T, S, n), (T, S, K), (T, S); False where it is sample by sample."""
-        if self.scaling or not isinstance(self._filter, KernelFilter):
+        if self.scaling or self.periodic or not isinstance(self._filter, KernelFilter):
             return False
         self._filter.stretch(self.state, x, y, lapse)
         return True
 
     def learn(self, x: Tensor, y: Tensor, lapse: Tensor | None = None) -> None:
         """Learn one sample a stream: (S, n), (S, K), (S,)."""
-        if not self.scaling or x.is_meta:  # without numbers there are no units to learn
+        x = self._near(x)
+        if self.scaling and not x.is_meta:  # without numbers there are no units to learn
+            self._learn_in_units(x, y, lapse)
+        else:
             self._filter.learn(self.state, x, y, lapse)
-            return
+        if self.periodic:
+            rows = x.reshape(self.latest.shape)
+            self.latest = torch.where(torch.isfinite(rows), rows, self.latest)
+
+    def _learn_in_units(self, x: Tensor, y: Tensor, lapse: Tensor | None) -> None:
         n, both = self.state.dim, torch.cat((x, y), 1).double()
         calm = self._calm and bool(both.isfinite().all()) and not self._far(both)
         due = None
@@ -143,6 +191,13 @@ class FilterStreams:
         if not calm or self._even % LOOKED_AT == 0:
             self._grow()
             self._see()
+
+    def _near(self, x: Tensor) -> Tensor:
+        """x (S, n), angles turned to the latest where there is one."""
+        if not self.periodic:
+            return x
+        latest = self.latest.reshape(x.shape)
+        return torch.where(latest.isnan() | x.isnan(), x, turned(x, latest, self.periodic))
 
     def _see(self) -> None:
         """Note whether all streams have their units and are at the same place of their latest samples: the
@@ -285,6 +340,7 @@ class FilterStreams:
         fresh = StreamState.empty(self.state.blocks, len(rows), *self.state.sizes)
         self.state.replace(rows, fresh)
         self._begin(rows)
+        self.latest[rows] = torch.nan
         self._center, self._spread = self.units.to(self.dtype).chunk(2, dim=1)
         self._calm = False
 
@@ -297,6 +353,8 @@ class FilterStreams:
         state = self.state.with_table(table, torch.cat((self.state.counts, fresh.counts), 1))
         new = self.units.new_full((streams, self.units.shape[1]), torch.nan)
         self.units, self._known = torch.cat((self.units, new)), torch.cat((self._known, new))
+        unseen = self.latest.new_full((streams, self.state.dim), torch.nan)
+        self.latest = torch.cat((self.latest, unseen))
         self.first = torch.cat((self.first, self.first.new_zeros(streams, *self.first.shape[1:])))
         self.clock, self.turn = (torch.cat((a, a.new_zeros(streams))) for a in (self.clock, self.turn))
         self._may_grow, self._stretch = (_joined(a, streams) for a in (self._may_grow, self._stretch))
@@ -307,7 +365,7 @@ class FilterStreams:
     def keep(self, rows: Tensor) -> None:
         """Go on with the streams with these numbers alone."""
         state = self.state.with_table(self.state.table[:, rows], self.state.counts[:, rows])
-        for name in ("units", "first", "clock", "turn", "_known", "_stretch", "_may_grow"):
+        for name in ("units", "first", "clock", "turn", "latest", "_known", "_stretch", "_may_grow"):
             setattr(self, name, getattr(self, name)[rows])
         self._hold(self.definition.of_rows(rows), state)
 
@@ -321,7 +379,8 @@ class FilterStreams:
 
     def _learned(self) -> dict[str, Tensor]:
         """All tensors that learning changes."""
-        own = {name: getattr(self, name) for name in ("units", "clock", "turn", "first")}
+        names = ("units", "clock", "turn", "first", *(["latest"] if self.periodic else []))
+        own = {name: getattr(self, name) for name in names}
         law = {"ratio": self.definition.ratio, "forgetting": self.definition.forgetting}
         return {"table": self.state.table, "counts": self.state.counts} | own | law
 
@@ -342,7 +401,7 @@ class FilterStreams:
                 told = "must have the kernel, radius and centers of this regressor"
                 raise ValueError(f"`load_state_dict(state=...)` {told}; {name!r} differs.")
         kept = self.state.with_table(state["table"], state["counts"].clone())
-        for name in ("units", "clock", "first", "turn"):
+        for name in {"units", "clock", "first", "turn", "latest"} & {*self._learned()}:
             setattr(self, name, state[name].clone())
         self._hold(self.definition.with_law(state["ratio"].clone(), state["forgetting"].clone()), kept)
 

@@ -16,6 +16,7 @@ from ..centers.layouts import RING_COUNTS
 from ..kernels import NAMED, GaussianKernel, Kernel
 from ..lanes.gradients import refuse_gradient
 from ..lanes.row_numbers import RowNumbers
+from ..numerics.angles import turned
 from ..numerics.checks import choice, fail, flag, integer, positive_real, real, trailing
 from ..numerics.default_device import device_of, on
 from ..signs import Sign
@@ -26,7 +27,6 @@ from .kalman_filter import LocalFilter, smooth_record
 from .local_functions import NAMES, LocalFunctions, OwnFunctions, has_rows, own_functions, own_law
 from .samples import lapses, like_given, pair, single, tensor_of
 from .stream_state import StreamState
-from .streams import Streams, TurningStreams, turned_in_time
 from .tuning import CENTERS, Tuning, tuned_streams, tuning
 
 _log = logging.getLogger(__name__)
@@ -152,7 +152,7 @@ class StaFRegressor(StreamEstimator):
         choice(f"{_NAME}.tune", "method", method, ("search", "gradient"))
         states, values = pair(f"{_NAME}.tune", x, y, (2, 3))
         trailing(f"{_NAME}.tune", "x", states, 2, meta=False)
-        states = turned_in_time(states, self._angles(states.shape[-1]))
+        states = self._turned(states)
         targets = values if values.dim() == states.dim() else values.unsqueeze(-1)
         rows = [part.unsqueeze(1) if states.dim() == 2 else part for part in (states, targets)]
         with on(states.device):
@@ -191,7 +191,7 @@ class StaFRegressor(StreamEstimator):
             learned stays as it is.
         """
         states, values = pair(f"{_NAME}.smooth", x, y, (2, 3))
-        states = turned_in_time(states, self._angles(states.shape[-1]))
+        states = self._turned(states)
         steps, streams = lapses(f"{_NAME}.smooth", time, states), self._fresh_streams(states[0], values[0])
         rows = (len(states), streams.count, -1)
         whole = states.new_ones(rows[:2], dtype=torch.float64) if steps is None else steps.expand(rows[:2])
@@ -233,7 +233,7 @@ class StaFRegressor(StreamEstimator):
         """
         call = f"{_NAME}.forecast"
         states, values = pair(call, x, y, (2, 3), recorded=True)
-        states = turned_in_time(states, self._angles(states.shape[-1]))
+        states = self._turned(states)
         steps, n = lapses(call, time, states), states.shape[-1]
         at = states.double().reshape(len(states), -1, n)
         of = values.double().reshape(*at.shape[:2], -1)
@@ -258,9 +258,8 @@ class StaFRegressor(StreamEstimator):
         """Return streams that have learned nothing, for samples like these, which are not turned."""
         twin = self._twin()
         twin._prepare(x, y)
-        streams = twin._streams_.inner if isinstance(twin._streams_, TurningStreams) else twin._streams_
-        assert isinstance(streams, FilterStreams)
-        return streams
+        assert isinstance(twin._streams_, FilterStreams)
+        return twin._streams_
 
     def _recorded_filter(self, streams: int, outputs: int, like: Tensor) -> LocalFilter:
         """Return the filter of tensors that autograd sees, for states like (n,)."""
@@ -298,19 +297,25 @@ class StaFRegressor(StreamEstimator):
             raise ValueError(f"`{_NAME}` was tuned for {was}; got {now}: {rule}.")
         return Tuning(*(part.to(like.device) for part in self._tuning))
 
-    def _begin(self, streams: int, outputs: int, like: Tensor) -> Streams:
-        begun, angles = self._filters(streams, outputs, like), self._angles(len(like))
-        if not angles:
-            return begun
-        return TurningStreams(begun, angles, like.new_full((streams, len(like)), math.nan))
-
     def _angles(self, dim: int) -> tuple[int, ...]:
         """Return the checked periodic coordinates."""
         if not set(self.periodic) <= set(range(-dim, dim)):
             raise fail(_NAME, "periodic", f"must be coordinates of {dim}", list(self.periodic))
         return tuple(sorted({index % dim for index in self.periodic}))
 
-    def _filters(self, streams: int, outputs: int, like: Tensor) -> FilterStreams:
+    def _turned(self, x: Tensor) -> Tensor:
+        """A record (T, ...) whose angles are turned sample by sample to the one measured before."""
+        periodic = self._angles(x.shape[-1])
+        if not periodic:
+            return x
+        rows, latest = [], x[0]
+        for now in x:
+            rows.append(torch.where(latest.isnan() | now.isnan(), now, turned(now, latest, periodic)))
+            latest = torch.where(torch.isfinite(rows[-1]), rows[-1], latest)
+        return torch.stack(rows)
+
+    def _begin(self, streams: int, outputs: int, like: Tensor) -> FilterStreams:
+        angles = self._angles(len(like))
         dim, dtype, toward = len(like), like.dtype, self._directions(len(like), like.device)
         scaling, found = flag(_NAME, "scaling", self.scaling), self._tuned(streams, outputs, like)
         kernel, numbers = _kernel(self.kernel), {name: getattr(self, name) for name in NAMES}
@@ -320,11 +325,11 @@ class StaFRegressor(StreamEstimator):
             filter_ = _own_filter(own, own_functions(_NAME, kernel.to(like.device), own["radius"], toward))
             self.centers_offsets_ = own["radius"][:, None, None] * toward
             state = StreamState.empty(like, streams, dim, len(toward), outputs)
-            return FilterStreams(filter_, state, scaling)
+            return FilterStreams(filter_, state, scaling, periodic=angles)
         robust = math.inf if self.robust is None else positive_real(_NAME, "robust", single(self.robust))
         if found is not None:
             self.centers_offsets_ = found.radius[0] * toward
-            return tuned_streams(found, toward, dtype, robust, float(single(self.follow)))
+            return tuned_streams(found, toward, dtype, robust, float(single(self.follow)), angles)
         radius = positive_real(_NAME, "radius", single(self.radius))
         law = torch.tensor(self._law(dtype), dtype=torch.float64, device=like.device)
         follow = real(_NAME, "follow", single(self.follow))
@@ -339,7 +344,8 @@ class StaFRegressor(StreamEstimator):
         ratio, forgetting = law.unsqueeze(1).repeat(1, streams)
         base = float(single(self.amplitude)) ** 2
         filter_ = LocalFilter(functions, ratio, forgetting, follow * radius, robust, base)
-        return FilterStreams(filter_, StreamState.empty(like, streams, dim, len(offsets), outputs), scaling)
+        state = StreamState.empty(like, streams, dim, len(offsets), outputs)
+        return FilterStreams(filter_, state, scaling, periodic=angles)
 
     def _law(self, dtype: torch.dtype) -> tuple[float, float]:
         """Return the checked variance of the noise in units of the process's, and the forgetting."""

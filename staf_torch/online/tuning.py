@@ -202,7 +202,12 @@ def _untold(found: Tuning, y: Tensor) -> Tuning:
 
 
 def tuned_streams(
-    found: Tuning, directions: Tensor, dtype: torch.dtype, robust: float, follow: float
+    found: Tuning,
+    directions: Tensor,
+    dtype: torch.dtype,
+    robust: float,
+    follow: float,
+    periodic: tuple[int, ...],
 ) -> FilterStreams:
     """Streams with these hyperparameters; the radius of the first serves all."""
     n, outputs = directions.shape[1], found.center.shape[1] - directions.shape[1]
@@ -214,7 +219,7 @@ def tuned_streams(
     )
     stretch = torch.cat((found.width, found.width.new_ones(len(found.width), outputs)), 1)
     units = torch.cat((found.center, found.spread), 1)
-    return FilterStreams(filter_, state, True, units, stretch, found.unknown)
+    return FilterStreams(filter_, state, True, units, stretch, found.unknown, periodic)
 
 
 def _scores(candidates: _Candidates, samples: Tensor, n: int, offsets: Tensor) -> Tensor:

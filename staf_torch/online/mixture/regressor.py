@@ -17,9 +17,9 @@ from ...centers import simplex
 from ...kernels import GaussianKernel
 from ...lanes.compilation.compiler import compiled
 from ...numerics.checks import flag, integer, positive_real, trailing
-from ..compiled_filter import NATIVE, FunctionPointers
+from ..compiled_filter import NATIVE, functions_in_c
 from ..estimator import StreamEstimator
-from ..filter_streams import refuse_other, table_of
+from ..filter_streams import Streams, refuse_other, table_of
 from ..local_functions import LocalFunctions
 from ..samples import pair
 from .definition import BankDefinition
@@ -43,7 +43,11 @@ _NUMBERS = len(Rules.of(1, True).numbers())
 class RulesInC(ctypes.Structure):
     """`Rules` of _bank.hpp: numbers, then the local functions of the filters."""
 
-    _fields_ = (("numbers", ctypes.c_double * _NUMBERS), ("functions", FunctionPointers))
+    _fields_ = (
+        ("numbers", ctypes.c_double * _NUMBERS),
+        ("functions", ctypes.c_void_p * 4),
+        ("rate_and_reach", ctypes.c_double * 2),
+    )
 
 
 class BankStreams(ctypes.Structure):
@@ -55,7 +59,7 @@ class BankStreams(ctypes.Structure):
 _packed = struct.Struct("8q").pack  # `Call` of _bank.cpp: what belongs to a call alone
 
 
-class Bank:
+class Bank(Streams):
     """Bounded memory, local Gaussian processes on it, and carried models, for many streams.
 
     A stream keeps C samples: the latest `RECENT` and others spread in space, as a full store gives up the
@@ -101,8 +105,10 @@ class Bank:
         width = CARRIED_WIDTH * math.sqrt(shape.dim)
         functions = LocalFunctions.of(GaussianKernel(width), CARRIED_RADIUS * width * simplex(shape.dim))
         rules = Rules.of(shape.dim, scaling, doubtful)
-        pointers, self._held = FunctionPointers.of(functions)
-        self._rules = RulesInC((ctypes.c_double * _NUMBERS)(*rules.numbers()), pointers)
+        *self._held, rate, reach = functions_in_c(functions)
+        self._rules = RulesInC(
+            tuple(rules.numbers()), tuple(part.data_ptr() for part in self._held), (float(rate), float(reach))
+        )
         self._run = _built(shape) if compile else None
         self.compiled = self._run is not None  # and not the definition
         self.definition = BankDefinition(shape, rules, functions)
@@ -132,13 +138,6 @@ class Bank:
             self.definition.clear(stream)
         self.table[rows] = part
         self._forget_answers()
-
-    def stretch(self, x: Tensor, y: Tensor, lapse: Tensor) -> bool:
-        """Return False: samples are learned one by one."""
-        return False
-
-    def direct(self, shape: tuple[int, ...], targets: tuple[int, ...]) -> None:
-        """No calls without a lock: they take a tenth of a millisecond."""
 
     @property
     def count(self) -> int:

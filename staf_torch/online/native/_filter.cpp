@@ -6,14 +6,9 @@ struct Streams {
     int64_t streams, stride, closed;  // closed: their owner changes them, and direct calls do nothing
     REAL *table;                       // see StreamState: blocks of the rows of `lanes` streams
     int64_t *counts;                   // (4, stride)
-    const double *ratio, *forgetting;  // (streams)
-#ifdef OWN  // columns, in blocks of the numbers of `lanes` streams
-    const V *offsets, *squares, *newton, *gram, *rate, *reach, *slack2, *robust, *base;
+    const double *ratio, *forgetting;  // (streams); then numbers of all, or in blocks of those of `lanes` streams
+    const Number *offsets, *squares, *newton, *gram, *rate, *reach, *slack2, *robust, *size;
     double tiny, most;
-#else
-    Functions functions;
-    double slack2, robust, base, tiny, most;
-#endif
 };
 struct Given {  // what belongs to a call alone: another thread may ask the same streams
     const Streams *of;
@@ -98,21 +93,18 @@ INLINE void read(const Call &call, int64_t first, int count, Filter &s) {
     s.since = count_of(call, 3, first, count);
 }
 
+INLINE int64_t own_block(int64_t first) { return sizeof(Number) == sizeof(V) ? first / lanes : 0; }
 INLINE Law law_of(const Call &call, int64_t first, int count) {
     const V ratio = column(call.ratio + first, 1, count), forgetting = column(call.forgetting + first, 1, count);
-#ifdef OWN
-    const int64_t at = first / lanes;
-    return {ratio, forgetting, call.slack2[at], call.robust[at], root(call.base[at]), call.tiny, call.most};
-#else
-    return {ratio, forgetting, all(call.slack2), all(call.robust), std::sqrt(call.base), call.tiny, call.most};
-#endif
+    const int64_t at = own_block(first);
+    return {ratio, forgetting, all(call.slack2[at]), all(call.robust[at]), call.size[at], call.tiny, call.most};
 }
-#ifdef OWN
 INLINE Functions functions_of(const Call &call, int64_t first) {
-    const int64_t at = first / lanes;
+    const int64_t at = own_block(first);
     return {call.offsets + at * M * n, call.squares + at * M, call.newton + at * M * M, call.gram + at * M * M,
             call.rate[at], call.reach[at]};
 }
+#ifdef OWN
 struct Gathered {  // functions of streams from anywhere in a tile
     V offsets[M * n], squares[M], newton[M * M], gram[M * M], rate, reach;
     Gathered(const Call &call, const int64_t *rows, int count) {
@@ -130,8 +122,6 @@ struct Gathered {  // functions of streams from anywhere in a tile
     }
     Functions functions() const { return {offsets, squares, newton, gram, rate, reach}; }
 };
-#else
-INLINE const Functions &functions_of(const Call &call, int64_t) { return call.functions; }
 #endif
 
 static void tell(const Call &call) {
@@ -176,7 +166,7 @@ static void move(const Call &call, const int64_t *rows, int count, const V *h, c
     const Gathered gathered(call, rows, count);
     const Functions functions = gathered.functions();
 #else
-    const Functions &functions = call.functions;
+    const Functions functions = functions_of(call, 0);
 #endif
     found[K + 1] = moments(functions, h, mean, [&](int i) { return learned[i]; }, found);
     for (int l = 0; l < count; ++l) {
