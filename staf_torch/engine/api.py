@@ -21,13 +21,12 @@ from ..numerics.default_device import beside
 from ..optim.base import UpdateLaw
 from ..signs import Sign
 from . import row_program
-from .certificate import before_each, certify, first_link
 from .predictors import Predictor
 from .problem import Problem
 from .quantities import Known, know, numbers, precompute, with_certificate
 from .recursion import Carry, Corrected, Inputs, Recursion, kept_gain, last_weights, lost, recursion, start
-from .repeated_chase import key_of, remember, repeated
-from .result import ChaseResult, ChaseWeights, concatenate
+from .result import ChaseResult, ChaseWeights, before_each, certify, concatenate, first_link
+from .row_program import key_of, remember, repeated
 
 _WORKING_BYTES = 2**26
 

@@ -17,10 +17,9 @@ from ..lanes import each
 from ..lanes.device.kernel import beside_history
 from ..local_basis import LocalSpace
 from ..optim.objective import Precomputed, extremes
-from .certificate import Certificate
 from .problem import Problem
 from .recursion import Corrected
-from .result import ChaseResult
+from .result import Certificate, ChaseResult
 
 
 class Known(NamedTuple):

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from ..numerics.angles import turned
-from .compiled_filter import CompiledFilter, DirectCalls
-from .filter_program import KernelFilter
+from .compiled_filter import CompiledFilter, DirectCalls, KernelFilter
 from .kalman_filter import STREAK, LocalFilter
 from .local_functions import OwnFunctions
 from .stream_state import StreamState

@@ -20,8 +20,8 @@ from ..numerics.angles import turned
 from ..numerics.checks import choice, fail, flag, integer, positive_real, real, trailing
 from ..numerics.default_device import device_of, on
 from ..signs import Sign
+from .compiled_filter import Forecast, forecasts, log_density
 from .estimator import StreamEstimator
-from .filter_program import Forecast, forecasts, log_density
 from .filter_streams import FilterStreams
 from .kalman_filter import LocalFilter, smooth_record
 from .local_functions import NAMES, LocalFunctions, OwnFunctions, has_rows, own_functions, own_law

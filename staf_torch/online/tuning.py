@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ..kernels import GaussianKernel
 from ..numerics.default_device import designed_on_cpu
-from .filter_program import forecasts
+from .compiled_filter import forecasts
 from .filter_streams import FilterStreams, units_of
 from .kalman_filter import LocalFilter
 from .local_functions import LocalFunctions, OwnFunctions

@@ -12,8 +12,7 @@ from torch import Tensor
 
 import staf_torch as st
 from staf_torch import lanes
-from staf_torch.online.compiled_filter import CompiledFilter
-from staf_torch.online.filter_program import KernelFilter
+from staf_torch.online.compiled_filter import CompiledFilter, KernelFilter
 from staf_torch.online.kalman_filter import LocalFilter
 from staf_torch.online.local_functions import LocalFunctions, OwnFunctions
 from staf_torch.online.stream_state import StateParts, StreamState

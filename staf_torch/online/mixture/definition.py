@@ -15,7 +15,6 @@ from ..kalman_filter import ERROR_RATE, STREAK, LocalFilter, spread_with
 from ..local_functions import LocalFunctions
 from ..stream_state import StreamState
 from .members import QuadraticModels, Stretch, TrackerModels, learn_hyperparameters, quadratic_features
-from .mixing import constant, judge, mix
 from .rules import (
     FADING,
     GROUPS,
@@ -27,7 +26,10 @@ from .rules import (
     BankShape,
     Rules,
     answer_layout,
+    constant,
+    judge,
     layout,
+    mix,
     parts,
 )
 

@@ -190,7 +190,7 @@ static void local_processes(const Rules &r, const Stream &s, double now, const d
     }
 }
 
-// The members are mixed and judged: what mixture/mixing.py defines.
+// The members are mixed and judged: what mixture/rules.py defines.
 
 // The group of a member: see mixture/rules.py.
 constexpr int group_of(int i) {
