@@ -26,7 +26,6 @@ from ..figures.style import in_a_sweep
 from ..settings.plain import to_read
 from ..settings.suggestions import without_option, without_setting
 from ..signs import SHOWN, Progress
-from .workers import LostError
 
 _log = logging.getLogger(__name__)
 _KEPT_BYTES = 2**28
@@ -37,6 +36,12 @@ _LIGHT, _MANY = 2**24, 1024
 """Bytes that many jobs may keep together to be of one chunk all the same, and how many."""
 _UNREADABLE = (ValueError, TypeError, KeyError, AttributeError, OmegaConfBaseException)
 """What broken settings raise while they are grouped. The job itself says later what is wrong with it."""
+
+
+class LostError(Exception):
+    """A worker that ended without a result; the message says how."""
+
+
 USER_ERRORS = (ValueError, HydraException, OmegaConfBaseException, OSError, LostError)
 """What a setting, the disk or the machine can bring about; anything else is a defect and keeps its trace."""
 

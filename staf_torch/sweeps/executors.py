@@ -1,4 +1,4 @@
-"""Executors of a sweep's tensor batches: in this process or in others; `clusters` has the rest."""
+"""Executors of tensor batches: in this process, in others of this machine, by submitit (SLURM), by Ray."""
 
 from __future__ import annotations
 
@@ -7,39 +7,62 @@ import contextlib
 import itertools
 import logging
 import os
-import pickle
-import sys
+import signal
+import tempfile
 import time
-import warnings
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
-from omegaconf import DictConfig
-
-from ..figures.style import FigurePaper, in_a_sweep, printed_on
-from ..numerics.checks import integer
+from ..numerics.checks import choice, integer
 from ..settings.plain import ManySettings
-from ..signs import SHOWN, Progress
-from .batching import (
-    DEFERRED,
-    Batch,
-    Computed,
-    Deferred,
-    Done,
-    Failed,
-    Flat,
-    Outcome,
-    Written,
-    batches,
-    completion,
-    solve,
+from ..signs import Progress
+from .batching import Batch, Done, Failed, Flat, LostError, Outcome, batches, solve
+from .hydra_compat import env_override
+from .workers import (
+    Worker,
+    beginning,
+    check,
+    end_with,
+    give_memory_back,
+    pack,
+    ready,
+    solve_elsewhere,
+    unpack,
 )
-from .hydra_compat import env_override, trusted, trusted_packages
-from .workers import LostError, Worker, give_memory_back, ready
 
 _log = logging.getLogger(__name__)
 _MOST = 300  # characters of what is said of a lost worker
+EXECUTORS = ("inline", "process", "submitit", "ray")
+_EXTRAS = {"submitit": "slurm", "ray": "ray"}
+_LOOK = 0.5  # s between two looks for results
+_FINAL = {  # states that nobody should try again, and what they mean
+    "CANCELLED": "was cancelled",
+    "TIMEOUT": "ran into its time limit: give it more by hydra.launcher.submitit.timeout_min",
+    "DEADLINE": "did not end before its deadline",
+    "OUT_OF_MEMORY": "had too little memory: give it more by hydra.launcher.submitit.mem_gb",
+}
+
+
+def executor(name: object, workers: int | None, arguments: Mapping[str, Any], directory: Path) -> Executor:
+    """Return the executor of a name of `EXECUTORS`, as `hydra.launcher.executor` has it.
+
+    ``workers`` are tensor batches at once, None for as many as suit it, ``arguments`` those of the libraries,
+    by the executor's name. Raises ValueError for another name, or where the library is not installed.
+    """
+    choice("hydra.launcher", "executor", name, EXECUTORS)
+    try:
+        if name == "submitit":
+            return Submitit(workers, directory, arguments["submitit"])
+        if name == "ray":
+            return Ray(workers, arguments["ray"])
+    except ImportError as error:
+        extra = _EXTRAS[str(name)]
+        raise ValueError(
+            f"`hydra.launcher.executor={name}` needs the extra: pip install 'staf_torch[{extra}]' ({error})."
+        ) from error
+    return Process(workers) if name == "process" else Inline(workers)
 
 
 def compute(
@@ -63,19 +86,14 @@ def compute(
         directories: of every run, by its index.
         workers: compute the batches.
         finished: indices of jobs that need no outcome.
-        most: jobs of a batch at most.
-        measured: whether metrics are all that is wanted of a job in a batch.
+        most, measured: as in `batches`.
         tell: is told how many jobs are computed, with fractions while this process computes a batch.
     """
     planned = batches(flat, least=workers.pieces, most=most, measured=measured)
     del flat  # half of the memory that settings take
     planned = [batch for batch in planned if not set(finished).issuperset(batch)]
-    _log.log(
-        logging.DEBUG if measured else logging.INFO,
-        "%d jobs in %d tensor batches",
-        len(settings),
-        len(planned),
-    )
+    level = logging.DEBUG if measured else logging.INFO
+    _log.log(level, "%d jobs in %d tensor batches", len(settings), len(planned))
     # Absolute, since a worker may have another working directory.
     made = [
         Batch(settings.of(jobs), [os.path.abspath(directories(i)) for i in jobs], measured)
@@ -117,16 +135,42 @@ class Executor(abc.ABC):
     def __enter__(self) -> Executor:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        self.close(failed=kind is not None)
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:  # noqa: B027 (there may be nothing)
+        """Give back what the executor holds, and end what still runs."""
 
     @abc.abstractmethod
-    def close(self, *, failed: bool) -> None:
-        """Give back what the executor holds; where the sweep has failed, end what still runs."""
+    def map(self, batches: Sequence[Batch], progress: Progress) -> Iterator[tuple[int, Done]]:
+        """Yield the number of a batch and what it left, as they end; the share that is done of one goes to
+        ``progress`` where this process computes it."""
+
+
+class Inline(Executor):
+    """Compute the tensor batches one after the other in this process, each with all the threads of torch."""
+
+    @property
+    def workers(self) -> int:
+        return 1
+
+    def map(self, batches: Sequence[Batch], progress: Progress) -> Iterator[tuple[int, Done]]:
+        for number, batch in enumerate(batches):
+            start = time.monotonic()
+            outcomes = solve(batch.settings, progress)
+            give_memory_back()
+            yield number, Done(outcomes, time.monotonic() - start)
+
+
+class Elsewhere(Executor):
+    """Compute tensor batches in other processes.
+
+    A batch whose worker was lost is tried once more, and then fails alone.
+    """
 
     @abc.abstractmethod
-    def submit(self, batch: Batch, progress: Progress) -> Any:
-        """Begin a tensor batch and return a handle on it; ``progress`` is of use in this process alone."""
+    def submit(self, batch: Batch) -> Any:
+        """Begin a tensor batch and return a handle on it."""
 
     @abc.abstractmethod
     def wait(self, handles: dict[int, Any]) -> list[int]:
@@ -137,35 +181,29 @@ class Executor(abc.ABC):
         """Return what a batch left that has ended. Raises where the worker itself was lost."""
 
     def map(self, batches: Sequence[Batch], progress: Progress) -> Iterator[tuple[int, Done]]:
-        """Yield the number of a batch and what it left, as they end.
-
-        A batch whose worker was lost is tried once more, and then fails alone.
-        """
         running: dict[int, Any] = {}
         waiting = list(range(len(batches)))[::-1]
-        lost: dict[int, str] = {}
+        lost: set[int] = set()
         while waiting or running:
             while waiting and len(running) < self.workers:
                 number = waiting.pop()
                 try:
-                    running[number] = self.submit(batches[number], progress)
+                    running[number] = self.submit(batches[number])
                 except Exception as error:
-                    yield (
-                        number,
-                        _failed(batches[number], f"no worker process could be started ({_words(error)})"),
-                    )
+                    why = f"no worker process could be started ({_words(error)})"
+                    yield number, _failed(batches[number], why)
             for number in self.wait(running) if running else ():
                 handle = running.pop(number)
                 try:
                     done = self.result(handle)
                 except Exception as error:
                     if number not in lost and not isinstance(error, GivenUpError):
-                        lost[number] = _words(error)
-                        _log.warning("a worker was lost: %s; its batch is tried once more", lost[number])
+                        lost.add(number)
+                        _log.warning("a worker was lost: %s; its batch is tried once more", _words(error))
                         waiting.append(number)
                         continue
-                    said = "the worker was lost twice" if number in lost else "the worker was lost"
-                    done = _failed(batches[number], f"{said} ({_words(error)})")
+                    twice = " twice" if number in lost else ""
+                    done = _failed(batches[number], f"the worker was lost{twice} ({_words(error)})")
                 yield number, done
 
 
@@ -184,30 +222,7 @@ def _words(error: Exception) -> str:
     return said if len(said) <= _MOST else f"{said[: _MOST - 3]}..."
 
 
-class Inline(Executor):
-    """Compute the tensor batches one after the other in this process, each with all the threads of torch."""
-
-    @property
-    def workers(self) -> int:
-        return 1
-
-    def close(self, *, failed: bool) -> None:
-        return None
-
-    def submit(self, batch: Batch, progress: Progress) -> Done:
-        start = time.monotonic()
-        outcomes = solve(batch.settings, progress)
-        give_memory_back()
-        return Done(outcomes, time.monotonic() - start)
-
-    def wait(self, handles: dict[int, Done]) -> list[int]:
-        return list(handles)
-
-    def result(self, handle: Done) -> Done:
-        return handle
-
-
-class Process(Executor):
+class Process(Elsewhere):
     """Fresh processes of this machine, which share the cores between them and end with this one."""
 
     def __init__(self, workers: int | None = None) -> None:
@@ -215,18 +230,17 @@ class Process(Executor):
         self._idle: list[Worker] = []
         self._all: list[Worker] = []
 
-    def close(self, *, failed: bool) -> None:
+    def close(self) -> None:
         for worker in self._all:
             worker.end()
-        self._all, self._idle = [], []
 
-    def submit(self, batch: Batch, progress: Progress) -> Worker:
+    def submit(self, batch: Batch) -> Worker:
         self._idle = [worker for worker in self._idle if worker.alive()]
         if not self._idle:
             threads = max(1, (os.cpu_count() or 1) // self.workers)
             with env_override({"OMP_NUM_THREADS": str(threads)}):
                 self._all.append(Worker(solve_elsewhere))
-                self._idle.append(self._all[-1])
+            self._idle.append(self._all[-1])
         worker = self._idle.pop()
         worker.begin(*pack(batch))
         return worker
@@ -240,71 +254,162 @@ class Process(Executor):
         return done
 
 
-def pack(batch: Batch) -> tuple[bytes, list[str], list[str]]:
-    """Return the arguments of `solve_elsewhere`."""
-    return pickle.dumps(batch), list(sys.path), trusted_packages()
+class Submitit(Elsewhere):
+    """Run a tensor batch as a job of SLURM, or as a process of this machine (``cluster=local``).
 
-
-def unpack(pickled: bytes) -> Done:
-    """Unpickle what `solve_elsewhere` returned."""
-    done: Done = pickle.loads(pickled)
-    return done
-
-
-def solve_elsewhere(pickled: bytes, path: Sequence[str], packages: Sequence[str] = ()) -> bytes:
-    """Compute a pickled `Batch` in a process that has only just begun, and return the pickled `Done`.
-
-    It gets the command's `sys.path`, which may lead to a user's own modules, and the packages whose objects
-    the command's settings may name.
+    Jobs at once are one a core on this machine and any number on a cluster, unless ``workers`` says so;
+    submitit keeps its files in `.submitit` of the sweep's directory. ``arguments`` are those of
+    `submitit.AutoExecutor.update_parameters`, and `cluster` and `folder`.
     """
-    sys.path[:] = [*path, *(entry for entry in sys.path if entry not in path)]
-    start = time.monotonic()
-    with trusted(packages):
-        batch: Batch = pickle.loads(pickled)
-        outcomes = solve(batch.settings, SHOWN)
-        for i, outcome in enumerate(outcomes):
-            if isinstance(outcome, Deferred):
-                outcomes[i] = _run_whole(batch.settings[i], Path(batch.directories[i]))
-            elif isinstance(outcome, Computed) and batch.measured:
-                outcomes[i] = Written(outcome.metrics, ())
-        portable = [_portable(outcome) for outcome in outcomes]
-    give_memory_back()
-    return pickle.dumps(Done(portable, time.monotonic() - start))
 
+    def __init__(self, workers: int | None, directory: Path, arguments: Mapping[str, Any]) -> None:
+        super().__init__(workers)
+        import submitit
 
-def _run_whole(cfg: DictConfig, directory: Path) -> Outcome:
-    """Run an experiment that takes no part in batches, and keep its log for the parent."""
-    directory.mkdir(parents=True, exist_ok=True)
-    with _kept_log() as lines, in_a_sweep():
+        parameters = dict(arguments)
+        place, folder = parameters.pop("cluster", None), parameters.pop("folder", None)
+        self._executor = submitit.AutoExecutor(folder=_fresh(folder, directory), cluster=place)
+        self._executor.update_parameters(**{"name": "staf", "timeout_min": 24 * 60, **parameters})
+        self._local = self._executor.cluster in ("local", "debug")
+        self._task = Task((os.getpid(), beginning(os.getpid())) if self._local else None)
+        self._running: dict[str, Any] = {}
+
+    @property
+    def workers(self) -> int:
+        return super().workers if self._asked or self._local else 10**6
+
+    @property
+    def pieces(self) -> int:
+        return self.workers if self._asked or self._local else 1
+
+    def close(self) -> None:
+        for job in self._running.values():
+            with contextlib.suppress(OSError):
+                job.cancel(check=False)
+
+    def submit(self, batch: Batch) -> Any:
+        job = self._executor.submit(self._task, *pack(batch))
+        self._running[job.job_id] = job
+        return job
+
+    def wait(self, handles: dict[int, Any]) -> list[int]:
+        while True:
+            ended = [number for number, job in handles.items() if job.done()]
+            if ended:
+                return ended
+            check()  # nobody else does as long as no job ends
+            time.sleep(_LOOK)
+
+    def result(self, handle: Any) -> Done:
+        del self._running[handle.job_id]
+        written = handle.paths.result_pickle.exists
+        who = f"{'the process' if self._local else 'SLURM job'} {handle.job_id}"
         try:
-            with printed_on(FigurePaper.of(cfg.get("figures", True))):
-                return Written(completion(cfg, DEFERRED)(cfg, directory, SHOWN), lines)
+            if self._local and not written():  # submitit waits a quarter of a minute for a file
+                raise LostError("no file")
+            return unpack(handle.result())
         except Exception as error:
-            return Failed(error)
+            said = _last_of_trace(str(error)) if written() else None
+            state = "TIMEOUT" if said and "timed-out" in said else str(handle.state).partition(" ")[0]
+            why = _FINAL.get(state) or said or f"ended without a result ({state})"
+            kind = GivenUpError if state in _FINAL else LostError
+            raise kind(f"{who} {why}; its log: {handle.paths.stderr}") from error
+
+
+def _fresh(wanted: str | None, directory: Path) -> Path:
+    """Make a fresh folder: SLURM before 23.02 makes none for its logs, and what an earlier start, or a
+    stranger, left under the number of a job would be read as its result."""
+    above = directory / ".submitit" if wanted is None else Path(str(wanted).partition("%")[0])
+    above.mkdir(parents=True, exist_ok=True)
+    return Path(tempfile.mkdtemp(dir=above))
+
+
+class Task:
+    """Solves a batch within a job, which ends with its parent: the process of the command on the same
+    machine, and its `beginning`."""
+
+    def __init__(self, parent: tuple[int, str] | None) -> None:
+        self._parent = parent
+
+    def __call__(self, pickled: bytes, path: Sequence[str], packages: Sequence[str] = ()) -> bytes:
+        """Return what `solve_elsewhere` returns."""
+        if self._parent is not None:
+            end_with(*self._parent)
+        with _ended_by_signals():
+            return solve_elsewhere(pickled, path, packages)
+
+
+class _SignalledError(BaseException):
+    """An error that a handler of submitit raised within a batch, which is no error of the batch."""
+
+    def __init__(self, error: Exception) -> None:
+        super().__init__(str(error))
+        self.error = error
 
 
 @contextlib.contextmanager
-def _kept_log() -> Iterator[list[tuple[int, str]]]:
-    """Collect level and text of log messages and warnings in a list."""
-    lines: list[tuple[int, str]] = []
-    handler, root = logging.Handler(), logging.getLogger()
-    handler.emit = lambda record: lines.append((record.levelno, record.getMessage()))  # type: ignore[method-assign]
-    root.setLevel(logging.INFO)
-    root.addHandler(handler)
+def _ended_by_signals() -> Iterator[None]:
+    """Let submitit's handler of a time limit end the job, whatever catches errors in it."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGUSR1, signal.SIGUSR2)}
+    ours = {number: handler for number, handler in before.items() if callable(handler)}
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        try:
+            ours[signal.Signals(number)](number, frame)
+        except Exception as error:
+            raise _SignalledError(error) from None
+
+    for number in ours:
+        signal.signal(number, handle)
     try:
-        with warnings.catch_warnings():
-            warnings.showwarning = lambda message, *_, **__: lines.append((logging.WARNING, str(message)))
-            yield lines
+        yield
+    except _SignalledError as signalled:
+        raise signalled.error from None
     finally:
-        root.removeHandler(handler)
+        for number, handler in ours.items():
+            signal.signal(number, handler)
 
 
-def _portable(outcome: Outcome) -> Outcome:
-    """Return the outcome; an exception that cannot be pickled is replaced by one with its words."""
-    if not isinstance(outcome, Failed):
-        return outcome
-    try:
-        pickle.loads(pickle.dumps(outcome))
-    except Exception:
-        return Failed(RuntimeError(f"{type(outcome.error).__name__}: {outcome.error}"))
-    return outcome
+def _last_of_trace(said: str) -> str:
+    """Return the last line of a job's traceback, which submitit frames by dashes, with its logs below."""
+    lines = said.partition("You can check full logs")[0].splitlines()
+    return next(
+        (line.strip() for line in reversed(lines) if line.strip(" -")), "ended without a result or an error"
+    )
+
+
+class Ray(Elsewhere):
+    """Run a tensor batch as a task of Ray with one core, on this machine or on a Ray cluster; as many at once
+    as Ray has cores, unless ``workers`` says so."""
+
+    def __init__(self, workers: int | None, arguments: Mapping[str, Any]) -> None:
+        super().__init__(workers)
+        import ray
+
+        self._ray: Any = ray
+        self._ours = not ray.is_initialized()
+        if self._ours:
+            try:
+                ray.init(**{"log_to_driver": False, "include_dashboard": False, **arguments})
+            except Exception as error:  # Ray raises plain ones where a daemon of its ends as it begins
+                said = " ".join(str(error).split())
+                raise LostError(f"Ray could not be started ({type(error).__name__}: {said})") from error
+        self._solve = ray.remote(max_retries=0)(solve_elsewhere)  # `map` tries once more
+
+    @property
+    def workers(self) -> int:
+        return self._asked or max(1, int(self._ray.cluster_resources().get("CPU", 1)))
+
+    def close(self) -> None:
+        if self._ours:
+            self._ray.shutdown()
+
+    def submit(self, batch: Batch) -> Any:
+        return self._solve.remote(*pack(batch))
+
+    def wait(self, handles: dict[int, Any]) -> list[int]:
+        ready, _ = self._ray.wait(list(handles.values()), num_returns=1)
+        return [number for number, handle in handles.items() if handle in ready]
+
+    def result(self, handle: Any) -> Done:
+        return unpack(self._ray.get(handle))

@@ -21,8 +21,7 @@ from ..results.files import METRICS, ROWS, RUN, partial_name
 from ..signs import Pace, Progress, Sign, write
 from . import lock, table, workers
 from .batching import Outcome, reason
-from .clusters import executor
-from .executors import Executor, compute
+from .executors import Executor, compute, executor
 from .hydra_compat import Job, JobReturn, JobStatus, Plan, SweepJobs, without_hydra_overrides
 from .job import PRINTS, execute, objective, silence_terminal
 

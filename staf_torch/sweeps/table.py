@@ -28,11 +28,10 @@ from ..settings.chase import make_metrics, units_of
 from ..settings.plain import ManySettings
 from ..signs import Progress
 from . import workers
-from .batching import Computed, Failed, Outcome, Written, are_light, completion, reason
+from .batching import Computed, Failed, LostError, Outcome, Written, are_light, completion, reason
 from .executors import Executor, compute
 from .hydra_compat import SweepJobs
 from .job import recorded
-from .workers import LostError
 
 _log = logging.getLogger(__name__)
 SUMS = f".{ROWS}.sums"

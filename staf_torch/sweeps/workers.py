@@ -8,17 +8,39 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import logging
 import multiprocessing
 import multiprocessing.connection
 import os
+import pickle
 import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any
+
+from omegaconf import DictConfig
+
+from ..figures.style import FigurePaper, in_a_sweep, printed_on
+from ..signs import SHOWN
+from .batching import (
+    DEFERRED,
+    Batch,
+    Computed,
+    Deferred,
+    Done,
+    Failed,
+    LostError,
+    Outcome,
+    Written,
+    completion,
+    solve,
+)
+from .hydra_compat import trusted, trusted_packages
 
 _NUMBERS = (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
 _USUAL = (signal.SIG_DFL, signal.default_int_handler)
@@ -83,10 +105,6 @@ def name_and_code(error: KeyboardInterrupt) -> tuple[str, int]:
     number = error.number if isinstance(error, Stopped) else int(signal.SIGINT)
     said = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
     return said, 128 + number
-
-
-class LostError(Exception):
-    """A worker that ended without a result; the message says how."""
 
 
 class Worker:
@@ -214,3 +232,73 @@ def give_memory_back() -> None:
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # musl has none
         if trim is not None:
             trim(0)
+
+
+def pack(batch: Batch) -> tuple[bytes, list[str], list[str]]:
+    """Return the arguments of `solve_elsewhere`."""
+    return pickle.dumps(batch), list(sys.path), trusted_packages()
+
+
+def unpack(pickled: bytes) -> Done:
+    """Unpickle what `solve_elsewhere` returned."""
+    done: Done = pickle.loads(pickled)
+    return done
+
+
+def solve_elsewhere(pickled: bytes, path: Sequence[str], packages: Sequence[str] = ()) -> bytes:
+    """Compute a pickled `Batch` in a process that has only just begun, and return the pickled `Done`.
+
+    It gets the command's `sys.path`, which may lead to a user's own modules, and the packages whose objects
+    the command's settings may name.
+    """
+    sys.path[:] = [*path, *(entry for entry in sys.path if entry not in path)]
+    start = time.monotonic()
+    with trusted(packages):
+        batch: Batch = pickle.loads(pickled)
+        outcomes = solve(batch.settings, SHOWN)
+        for i, outcome in enumerate(outcomes):
+            if isinstance(outcome, Deferred):
+                outcomes[i] = _run_whole(batch.settings[i], Path(batch.directories[i]))
+            elif isinstance(outcome, Computed) and batch.measured:
+                outcomes[i] = Written(outcome.metrics, ())
+        portable = [_portable(outcome) for outcome in outcomes]
+    give_memory_back()
+    return pickle.dumps(Done(portable, time.monotonic() - start))
+
+
+def _run_whole(cfg: DictConfig, directory: Path) -> Outcome:
+    """Run an experiment that takes no part in batches, and keep its log for the parent."""
+    directory.mkdir(parents=True, exist_ok=True)
+    with _kept_log() as lines, in_a_sweep():
+        try:
+            with printed_on(FigurePaper.of(cfg.get("figures", True))):
+                return Written(completion(cfg, DEFERRED)(cfg, directory, SHOWN), lines)
+        except Exception as error:
+            return Failed(error)
+
+
+@contextlib.contextmanager
+def _kept_log() -> Iterator[list[tuple[int, str]]]:
+    """Collect level and text of log messages and warnings in a list."""
+    lines: list[tuple[int, str]] = []
+    handler, root = logging.Handler(), logging.getLogger()
+    handler.emit = lambda record: lines.append((record.levelno, record.getMessage()))  # type: ignore[method-assign]
+    root.setLevel(logging.INFO)
+    root.addHandler(handler)
+    try:
+        with warnings.catch_warnings():
+            warnings.showwarning = lambda message, *_, **__: lines.append((logging.WARNING, str(message)))
+            yield lines
+    finally:
+        root.removeHandler(handler)
+
+
+def _portable(outcome: Outcome) -> Outcome:
+    """Return the outcome; an exception that cannot be pickled is replaced by one with its words."""
+    if not isinstance(outcome, Failed):
+        return outcome
+    try:
+        pickle.loads(pickle.dumps(outcome))
+    except Exception:
+        return Failed(RuntimeError(f"{type(outcome.error).__name__}: {outcome.error}"))
+    return outcome

@@ -22,10 +22,9 @@ from staf_torch.experiments.registry import Metrics
 from staf_torch.results.files import write_metrics
 from staf_torch.settings.plain import ManySettings
 from staf_torch.signs import SHOWN, Progress
-from staf_torch.sweeps.batching import Batch, Done, Failed, Outcome, Written, completion, solve
-from staf_torch.sweeps.clusters import Task, executor
-from staf_torch.sweeps.executors import Executor, GivenUpError, compute, pack, solve_elsewhere, unpack
-from staf_torch.sweeps.workers import LostError
+from staf_torch.sweeps.batching import Batch, Done, Failed, LostError, Outcome, Written, completion, solve
+from staf_torch.sweeps.executors import Elsewhere, GivenUpError, Task, compute, executor
+from staf_torch.sweeps.workers import pack, solve_elsewhere, unpack
 
 SHORT = ["duration=0.05", "settle_time=0", "figures=false", "history=false"]
 MANY = {"inline": (1, 1), "process": (3, 3)}
@@ -39,7 +38,7 @@ def words(outcome: Outcome) -> str:
 # Any executor
 
 
-class Plan(Executor):
+class Plan(Elsewhere):
     """Ends the batches in the order in which they began; notes what goes on, and loses some."""
 
     def __init__(self, workers: int | None, lost: dict[str, list[Exception]] | None = None) -> None:
@@ -47,16 +46,13 @@ class Plan(Executor):
         self.notes: list[str] = []
         self.lost = lost or {}
 
-    def close(self, *, failed: bool) -> None:
-        self.notes.append("failed" if failed else "closed")
+    def close(self) -> None:
+        self.notes.append("closed")
 
-    def submit(self, batch: Batch, progress: Progress) -> Batch:
+    def submit(self, batch: Batch) -> Batch:
         self.notes.append(f"+{batch.directories[0]}")
         if batch.directories[0] == "refused":
             raise OSError("no\n room")
-        with progress.over(4, "steps") as advance:
-            for _ in range(4):
-                advance(1)
         return batch
 
     def wait(self, handles: dict[int, Any]) -> list[int]:

@@ -12,7 +12,8 @@ import pytest
 import worker_tasks
 from command_line import environment
 
-from staf_torch.sweeps.workers import LostError, Worker, ready
+from staf_torch.sweeps.batching import LostError
+from staf_torch.sweeps.workers import Worker, ready
 
 LOST = {
     "die": "it was ended by SIGKILL",
