@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import gc
 import importlib
@@ -19,7 +20,7 @@ from .. import __version__
 from ..results.build import source
 from ..settings import config_directory
 from ..signs import Sign, printed
-from ..sweeps.hydra_compat import VERSION, find_launcher, full_errors, is_about_settings, program
+from ..sweeps.hydra_compat import VERSION, application, find_launcher, full_errors, is_about_settings, program
 
 find_launcher()
 _PARTS = {
@@ -41,6 +42,46 @@ def main() -> None:
     `staf doctor`, `staf schema`, `staf docs` and `staf --version` are no runs, and Hydra is not asked.
     """
     words = sys.argv[1:]
+    _answer(words)
+    gc.disable()  # what torch makes stays: searches for garbage are a fifth of the time to load it
+    with Sign("loading torch", log=False):
+        from ..sweeps import callbacks
+        from ..sweeps.command import command_line, end, end_by_signal
+        from ..sweeps.job import Refused, execute
+        from ..sweeps.workers import stopped_by_signals
+    gc.freeze()
+    gc.enable()
+    typed = sys.argv
+    try:
+        with full_errors() as wants_trace, stopped_by_signals():
+            try:
+                argv = command_line(words)
+                if is_about_settings(argv):
+                    sys.argv = [typed[0], *argv]
+                    _showing()
+                    return
+                with application(argv) as app:
+                    try:
+                        (app.sweep if app.is_sweep() else app.run)(execute)
+                    except (Exception, KeyboardInterrupt) as error:
+                        if app.begun is None:
+                            raise
+                        callbacks.close(app.begun)
+                        end(error, wants_trace, app.begun)
+            except Refused as refused:
+                if wants_trace and refused.__cause__ is not None:
+                    raise refused.__cause__ from None
+                raise
+            except (Exception, KeyboardInterrupt) as error:
+                end(error, wants_trace)
+            finally:
+                sys.argv = typed
+    except KeyboardInterrupt as error:  # where a signal comes before the program has begun, or after its end
+        end_by_signal(None, error)
+
+
+def _answer(words: list[str]) -> None:
+    """Do what is no run, and exit: parts of their own, versions, help and settings."""
     if words == ["--version"]:
         sys.exit(print(f"staf_torch {__version__} (source {source()})"))
     if words and words[0] in _PARTS:
@@ -51,19 +92,11 @@ def main() -> None:
         sys.exit(f"staf: {_unknown(words[0])}")
     if words in (["--help"], ["-h"]):
         sys.exit(printed(f"{_help()}\n"))
-    try:
+    with contextlib.suppress(Exception):  # what a user got wrong, in the words of what runs something
         if not any(word.startswith("sweep.resume=") for word in words) and is_about_settings(words):
             with full_errors():
                 _showing()
-            return
-    except Exception:  # what a user got wrong, in the words of the command that runs something
-        pass
-    gc.disable()  # what torch makes stays: searches for garbage are a fifth of the time to load it
-    with Sign("loading torch", log=False):
-        running = importlib.import_module("staf_torch.cli.running")
-    gc.freeze()
-    gc.enable()
-    running.main()
+            sys.exit()
 
 
 def _help() -> str:

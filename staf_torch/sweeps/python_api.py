@@ -33,9 +33,9 @@ from ..tables.aggregate import in_order, lost_share
 from ..tables.model import data_frame, require, significant
 from . import callbacks
 from .batching import sentence
+from .command import command_line
 from .hydra_compat import application
 from .job import PRINTS, Refused, execute, silence_terminal
-from .resume import command_line
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -74,7 +74,7 @@ def run(*overrides: str, directory: str | Path | None = None) -> Run:
                 f"`staf_torch.run(...)` must be one run; got {' '.join(overrides)!r}, which is a sweep: "
                 "call `staf_torch.sweep`."
             )
-        path = app.run(_execute_silently)
+        path = Path(str(app.run(_execute_silently).hydra_cfg.hydra.runtime.output_dir))
     figures = {
         png.stem: figure
         for png in sorted((path / FIGURES).glob("*.png"))
@@ -117,7 +117,8 @@ def sweep(*overrides: str, directory: str | Path | None = None) -> Runs:
         application(command_line(["--multirun", *overrides, *place])) as app,
     ):
         try:
-            path = app.sweep(execute)
+            app.sweep(execute)
+            path = _directory(app.begun)
         except BaseException as error:
             path = _ended_early(error, app.begun)
     return read_runs(path)
@@ -173,11 +174,16 @@ def _ended_early(error: BaseException, broken: DictConfig | None) -> Path:
     if isinstance(error, KeyboardInterrupt):
         raise KeyboardInterrupt(callbacks.farewell(broken, error, "interrupted")) from None
     if broken is not None and isinstance(error, Exception):
-        directory = Path(str(broken.hydra.sweep.dir)).absolute()
+        directory = _directory(broken)
         begun = any(directory.glob(f"**/{RUN}"))
         if begun and any(row.status == FAILED for row in collect(directory).rows):
             return directory
     raise error
+
+
+def _directory(sweep: DictConfig | None) -> Path:
+    assert sweep is not None
+    return Path(str(sweep.hydra.sweep.dir)).absolute()
 
 
 @contextlib.contextmanager

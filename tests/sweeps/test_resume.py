@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from staf_torch import __version__
-from staf_torch.sweeps.resume import command_line, recorded
+from staf_torch.sweeps.command import command_line, recorded
 
 
 def sweep(place: Path, typed: Sequence[str] = ("seed=0,1",), hydra: Sequence[str] = (), **more: Any) -> Path:

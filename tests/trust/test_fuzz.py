@@ -22,7 +22,7 @@ from sweep_runs import write_run
 from staf_torch.results.files import UnreadableError
 from staf_torch.results.reader import collect
 from staf_torch.results.run_directory import History
-from staf_torch.sweeps.resume import command_line
+from staf_torch.sweeps.command import command_line
 from staf_torch.tables import html_text, json_text, latex_text, tabulate
 
 RECORD = {

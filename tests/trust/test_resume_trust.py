@@ -15,7 +15,7 @@ from command_line import one
 from staf_torch.results import build
 from staf_torch.results.reader import collect
 from staf_torch.results.run_directory import History
-from staf_torch.sweeps.resume import command_line, may_run_code
+from staf_torch.sweeps.command import command_line, may_run_code
 from staf_torch.tables import Layout, tabulate
 
 SHORT = ["duration=0.05", "settle_time=0", "figures=false", "trajectories=2"]

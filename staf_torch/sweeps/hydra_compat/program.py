@@ -13,7 +13,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import hydra
 from hydra import initialize_config_dir, version
@@ -49,50 +49,37 @@ _RESOLVERS = ("now", "hydra", "python_version", "hydra_override_dirname", "hydra
 """Hydra's own, which it registers where it begins."""
 
 
-class Application(NamedTuple):
-    """The library's own Hydra application, alive within `application`."""
+class Application:
+    """The library's own Hydra application, alive within `application`.
 
-    hydra: Any
-    name: str  # of the primary configuration
-    overrides: tuple[str, ...]
-    multirun: bool  # whether the command line asks for a sweep
+    ``run`` runs one job by a task, and ``sweep`` all of them: Hydra's own methods, which raise what the task
+    raises, of a sweep the error of the first job that failed, when all have ended.
+    """
+
+    def __init__(self, hydra: Any, name: str, overrides: Sequence[str], multirun: bool) -> None:
+        self._loader, self._name = hydra.config_loader, name
+        self._overrides, self._multirun = list(overrides), multirun
+        self.run = functools.partial(hydra.run, name, overrides=[*overrides, "hydra.mode=RUN"])
+        self.sweep = functools.partial(hydra.multirun, name, overrides=[*overrides, "hydra.mode=MULTIRUN"])
+        self._loader.latest_sweep = None
 
     def is_sweep(self) -> bool:
-        """Return whether the settings themselves ask for a sweep, as those of `experiment=ablation` do."""
+        """Return whether the command line or the settings, as those of `experiment=ablation`, ask for one."""
+        if self._multirun:
+            return True
         try:
-            found = self.hydra.config_loader.load_configuration(
-                self.name, list(self.overrides), RunMode.MULTIRUN, validate_sweep_overrides=False
+            found = self._loader.load_configuration(
+                self._name, self._overrides, RunMode.MULTIRUN, validate_sweep_overrides=False
             )
         except Exception:  # the run itself raises it
             return False
+        self._loader.latest_sweep = None  # but the question whether this is one
         return bool(found.hydra.mode == RunMode.MULTIRUN)
-
-    def run(self, task: Callable[[DictConfig], Any]) -> Path:
-        """Run one job and return its directory.
-
-        Raises:
-            BaseException: that of Hydra or of the task.
-        """
-        self.hydra.config_loader.latest_sweep = None  # but the question whether this is one
-        with lock.returned():
-            ended = self.hydra.run(self.name, task, [*self.overrides, "hydra.mode=RUN"])
-        config: Any = ended.hydra_cfg
-        return Path(config.hydra.runtime.output_dir)
-
-    def sweep(self, task: Callable[[DictConfig], Any]) -> Path:
-        """Run a sweep and return its directory.
-
-        Raises:
-            BaseException: that of Hydra, or of the first job that failed, after all jobs have ended.
-        """
-        self.hydra.config_loader.latest_sweep = None
-        self.hydra.multirun(self.name, task, [*self.overrides, "hydra.mode=MULTIRUN"])
-        return Path(self.hydra.config_loader.latest_sweep.hydra.sweep.dir).absolute()
 
     @property
     def begun(self) -> DictConfig | None:
-        """The settings of the sweep that `sweep` has begun, None where it has not come so far."""
-        found: DictConfig | None = self.hydra.config_loader.latest_sweep
+        """The settings of the sweep that has begun, None where it has not come so far."""
+        found: DictConfig | None = self._loader.latest_sweep
         return found
 
 
@@ -105,7 +92,13 @@ def application(argv: Sequence[str]) -> Iterator[Application]:
     words = arguments(argv)
     name = words.config_name or "config"
     with contextlib.ExitStack() as stack:
-        for guard in (working_directory_imports, _environment, _other_application, handlers_aside):
+        for guard in (
+            working_directory_imports,
+            _environment,
+            _other_application,
+            handlers_aside,
+            lock.returned,
+        ):
             stack.enter_context(guard())
         find_launcher()
         plugin = importlib.import_module(
@@ -119,7 +112,7 @@ def application(argv: Sequence[str]) -> Iterator[Application]:
         running.config_loader = (
             Composer(config_loader(words.config_dir), name) if changes else _composer(name)
         )
-        yield Application(running, name, tuple(words.overrides), words.multirun)
+        yield Application(running, name, words.overrides, words.multirun)
 
 
 @functools.cache

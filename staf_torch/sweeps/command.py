@@ -1,18 +1,27 @@
-"""`sweep.resume=...`: the command line of a sweep that is taken up again."""
+"""The command line of `staf`, and how it ends.
+
+`staf -m sweep.resume=runs/<sweep>` becomes the command line of the sweep that is taken up again.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NoReturn
+
+from omegaconf import DictConfig
 
 from .. import __version__
 from ..results import run_record as records
 from ..results.files import FREE, is_free, visible
 from ..settings.trust import may_run_code
-from .callbacks import refuse_many
+from .batching import USER_ERRORS, sentence
+from .callbacks import farewell, refuse_many
 from .hydra_compat import overrides_in, parse_override
+from .workers import name_and_code, what_ended
 
 _RESUME = "sweep.resume="
 _ANYWAY = "sweep.resume_anyway=true"
@@ -153,3 +162,21 @@ def _difference(directory: Path, given: Sequence[str], typed: Sequence[str]) -> 
         f"got them {' and '.join(parts) or 'more than once'}. Only settings that change no number may be "
         f"others (hydra. ..., sweep. ..., {', '.join(FREE)}). The sweep is: staf -m {' '.join(typed)}"
     )
+
+
+def end(error: BaseException, wants_trace: bool, sweep: DictConfig | None = None) -> NoReturn:
+    """End the program as an error asks for: by a sentence, by the code of a signal, or by its trace."""
+    ended_by = what_ended(error)
+    if isinstance(ended_by, KeyboardInterrupt):
+        end_by_signal(sweep, ended_by)
+    if wants_trace or not isinstance(error, USER_ERRORS):
+        raise error
+    sys.exit(f"staf: {sentence(error)}")
+
+
+def end_by_signal(sweep: DictConfig | None, error: KeyboardInterrupt) -> NoReturn:
+    """Say which signal ended the program and how to resume, and exit with the code that shells expect."""
+    said, code = name_and_code(error)
+    with contextlib.suppress(OSError):  # the terminal may be gone
+        sys.stderr.write(farewell(sweep, error, said) + "\n")
+    sys.exit(code)
