@@ -47,11 +47,7 @@ _is_exporting = getattr(torch.compiler, "is_exporting", torch.compiler.is_compil
 
 
 class Served(Protocol):
-    """The callable in the place of a method: (n,) or (B, n) to (B, 1, m), or trees of (B, ...) to such.
-
-    Attributes:
-        at_once: by shape, strides and dtype of x what finds y, (n,) to (m,) or (B, n) to (B, m).
-    """
+    """The callable in the place of a method: (n,) or (B, n) to (B, 1, m), or trees of (B, ...) to such."""
 
     at_once: dict[Any, Callable[[Tensor], Tensor]]
 
@@ -143,13 +139,7 @@ def bound_to(owner: Any) -> dict[Any, Any]:
 
 
 class CompiledMethod:
-    """A method of an owner, by its definition or by a program.
-
-    Args:
-        definition: plain torch, of one row or many.
-        owner: that holds all that the definition reads.
-        settings: of the decorator.
-    """
+    """A method of an owner, by its definition or by a program."""
 
     def __init__(self, definition: Callable[..., Tree], owner: Any, settings: compiled) -> None:
         self.definition, self.owner, self._settings = definition, owner, settings

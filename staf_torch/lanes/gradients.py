@@ -83,9 +83,6 @@ def wants_gradient(*given: Any) -> bool:
 def gradients_of(call: str, **given: Any) -> tuple[Tensor, ...]:
     """Return the tensors that require a gradient, of an object that keeps numbers made from them: as
     `refuse_gradient` where autograd is on, and where it is off all that somebody may ask for later.
-
-    Args:
-        call, given: as in `refuse_gradient`.
     """
     if torch.is_grad_enabled():
         return refuse_gradient(call, **given)
@@ -161,10 +158,6 @@ def _wanting(value: Any, depth: int = 6) -> tuple[list[Tensor], list[Tensor]]:
 def _surely_none(value: Any, seen: dict[int, Any]) -> bool:
     """Return whether modules and containers of this library's and torch's, down to numbers and tensors, hold
     no tensor that requires a gradient: a tenth of the time of a walk. False where there is more to look at.
-
-    Args:
-        value: to look into.
-        seen: what has been looked into, by its address.
     """
     kind = type(value)
     if kind in _NUMBERS:
@@ -221,13 +214,7 @@ class _Unserved(torch.autograd.Function):
 def grad(
     function: Callable[..., Any], argnums: int | tuple[int, ...] = 0, has_aux: bool = False
 ) -> Callable[..., Any]:
-    """Return the derivative of a function whose value is one number, as `torch.func.grad`.
-
-    Args:
-        function: of tensors.
-        argnums: of the arguments by which it is differentiated.
-        has_aux: whether the function returns a pair, of which the second part is passed on.
-    """
+    """Return the derivative of a function whose value is one number, as `torch.func.grad`."""
 
     def slope(*args: Any) -> Any:
         if torch.compiler.is_compiling():  # torch's compiler knows its own transform

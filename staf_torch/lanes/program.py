@@ -343,10 +343,7 @@ class Program(Derived):
     def follower(self, kind: Hashable, step_of: Callable[[Program], Step], *, follows: bool) -> Program:
         """Return the program of a step that is made from this one's.
 
-        Args:
-            kind: of it.
-            step_of: makes it from a program.
-            follows: whether it may be traced where the program was that this one follows.
+        It may be traced where the program was that this one ``follows``.
         """
         with self._lock:
             if kind not in self._followers:

@@ -49,11 +49,7 @@ _ENTRYWISE = frozenset(f"aten::{name}" for name in ("_to_copy", "detach", "clone
 
 
 class RowsMetError(BaseException):  # no handler of errors in a user's code is meant
-    """The signal that a function read numbers of rows where nobody had said whose.
-
-    Args:
-        numbers: that were read.
-    """
+    """The signal that a function read numbers of rows where nobody had said whose."""
 
     def __init__(self, numbers: RowNumbers) -> None:
         super().__init__()
@@ -61,11 +57,7 @@ class RowsMetError(BaseException):  # no handler of errors in a user's code is m
 
 
 class RowNumbers(Tensor):
-    """A tensor of which every row of a batch has its own entry; `rows` makes it.
-
-    Attributes:
-        full: (B, ...), the numbers of all rows.
-    """
+    """A tensor of which every row of a batch has its own entry; `rows` makes it."""
 
     full: Tensor
     made = False  # whether a process has any

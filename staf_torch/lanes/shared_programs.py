@@ -191,15 +191,7 @@ def check_states(given: Sequence[Tensor]) -> None:
 
 
 class Rows:
-    """y = function(a, b, ...), (B, ...) to (B, ...), where nobody traces or differentiates.
-
-    Args:
-        function: plain torch, in which no row sees another.
-        name: in the log.
-        parts: all that ``function`` reads, for `shared_program`; none where nothing is to be shared.
-        copies: as in `Program`.
-        make: ``function`` from the parts, as in `shared_program`.
-    """
+    """y = function(a, b, ...), (B, ...) to (B, ...), where nobody traces or differentiates."""
 
     def __init__(
         self,

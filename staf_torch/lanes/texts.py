@@ -78,14 +78,7 @@ class Built(NamedTuple):
 
 
 def known(step: Step, described: tuple[bytes, Sequence[Tensor]] | None, given: Given, form: Form) -> Trace:
-    """Return the trace of a step with a single row, from the cache where it has been traced before.
-
-    Args:
-        step: of the program.
-        described: as `Program.described` was told; None where nobody has.
-        given: examples of the inputs.
-        form: of the code.
-    """
+    """Return the trace of a step with a single row, from the cache where it has been traced before."""
     shapes = None if described is None else Contents(given.key()).signature()
     if described is None or shapes is None or not unpatched():
         return written(step, given, form)

@@ -68,15 +68,8 @@ class _Adjoint(NamedTuple):
 class Backward:
     """The backward pass of one call.
 
-    Args:
-        ran: the call.
-        tensors: inputs, captured tensors, columns of rows' numbers.
-        needs: which of them have a gradient.
-        ends: gradients by the carry and the outputs, None where there are none.
-
-    Attributes:
-        built: of the adjoint; None where there is none.
-        slopes: by the carry before the first time, with the places of its leaves; none before `run`.
+    ``tensors`` are inputs, captured tensors and columns of rows' numbers, ``needs`` which of them have a
+    gradient, ``ends`` gradients by the carry and the outputs, None where there are none.
     """
 
     def __init__(

@@ -76,12 +76,8 @@ class Rooms(NamedTuple):
 class Keeping:
     """Recipe of the tensors of calls that keep the carry, on the processor.
 
-    Args:
-        compiled: the program: its outputs are the results, or these and the carry before a step.
-        trace: of the program of the latter kind.
-        keeps: leaves of the carry that are wanted.
-        results: how many there are.
-        sizes: rows and times.
+    The outputs of ``compiled`` are the ``results``, or these and the carry before a step; ``keeps`` are the
+    leaves of the carry that are wanted.
     """
 
     def __init__(
@@ -155,13 +151,7 @@ UNIT = 64
 
 
 class AtTimes:
-    """Gradients by what times bring, put together of blocks of rows and times.
-
-    Args:
-        leaves: what they are by.
-        rows, times: all of them.
-        like: dtype and device.
-    """
+    """Gradients by what times bring, put together of blocks of rows and times."""
 
     def __init__(self, leaves: Sequence[Any], rows: int, times: int, like: Tensor) -> None:
         self.leaves, self.like = leaves, like

@@ -94,17 +94,7 @@ class Ran(NamedTuple):
 
 
 class GradientCall:
-    """A call of a program of which gradients are wanted, for inputs of fixed forms.
-
-    Args:
-        program: that is called.
-        given: inputs of such forms.
-        every: times from one recorded output to the next.
-
-    Attributes:
-        sizes: how many inputs a row has once, how many come at every time, and how many are the carry.
-        followers: programs of adjoints, the places of what was built of them, and of which trace they are.
-    """
+    """A call of a program of which gradients are wanted, for inputs of fixed forms."""
 
     def __init__(self, program: Program, given: Given, every: int) -> None:
         self.program, self.every, self.rows, self.times = program, every, given.rows, given.times
@@ -219,15 +209,7 @@ class GradientCall:
     ) -> list[Tensor]:
         """Run a program; return what it returns.
 
-        Args:
-            where: its inputs are.
-            built: the program.
-            given: its inputs.
-            own: columns of rows' numbers.
-            every: times from one recorded output to the next.
-            back: whether from the last time to the first.
-            rooms: tensors of the program's dtype to write to, on the CPU; none where they are new.
-            again: what makes inputs of times, of `again`.
+        On the CPU it writes to ``rooms``, if there are any, and ``again`` makes inputs of times.
         """
         plan, leaves = self._plan(where, built, given, own, every, back, rooms)
         if rooms and isinstance(plan, PlannedCall):
@@ -241,11 +223,8 @@ class GradientCall:
     def again(self, built: Built, given: Given, own: Sequence[Tensor], to: Sequence[int]) -> Any:
         """Return what makes inputs of the adjoint while that runs, on the CPU.
 
-        Args:
-            built: the program that also puts out the carry before every step.
-            given: its inputs.
-            own: columns of rows' numbers.
-            to: of each of its results, the carry before the outputs: which input of a time, or -1.
+        ``to`` says of each result of the program, the carry before the outputs, which input of a time it is,
+        or -1.
         """
         plan, leaves = self._plan(True, built, given, own, 1, False, ())
         assert isinstance(plan, PlannedCall)

@@ -32,11 +32,8 @@ Operand = tuple[int, Any]
 class Reverse:
     """Slopes by the inputs of a step.
 
-    Args:
-        step: to whose graph they are added.
-        slots: kinds and numbers of inputs of which they are wanted, ("now", 0), and of how many entries;
-            ("param", k) are numbers of the table.
-        numbers: the slot and the entry of every number of the table that has slopes.
+    ``slots`` are kinds and numbers of inputs of which slopes are wanted, ("now", 0), and of how many
+    entries; ("param", k) are numbers of the table, ``numbers`` the slot and the entry of each of them.
     """
 
     def __init__(

@@ -68,12 +68,6 @@ def adjoint_step(
     Its carry is (gradients by the carry's leaves that matter, sums over times of those by what a row has once
     and by captured tensors), its inputs of a time (the carry before, leaf by leaf, the inputs, the gradients
     by the outputs that have one), its inputs of a row (their leaves, captured tensors, numbers of rows).
-
-    Args:
-        step: of a program.
-        structures: of the program's inputs.
-        wanted: for which there are gradients.
-        captured, numbers: those of ``wanted``.
     """
 
     def adjoint(carry: Tree, now: Tree, row: Tree) -> tuple[Tree, Tree]:
@@ -115,11 +109,7 @@ def adjoint_step(
 class ReversedStep:
     """The step of `adjoint_step` as the reverse of the numbers of a step, where torch's conventions allow it.
 
-    Args:
-        step: of a program.
-        given: one row and one time of it.
-        wanted: for which there are gradients.
-        numbers: of its table that have some: where each run of them begins, and its length.
+    ``numbers`` of its table have slopes: where each run of them begins, and its length.
     """
 
     def __init__(
@@ -153,15 +143,7 @@ class Deciding(NamedTuple):
 def deciding(
     step: Step, given: Given, own: Sequence[Tensor], ends: Sequence[bool], outputs: Sequence[bool]
 ) -> Deciding:
-    """Find out what an adjoint depends on by a step in plain torch, with all passes of loops.
-
-    Args:
-        step: of a program.
-        given: one row and one time.
-        own: numbers of rows that stand in it.
-        ends: which leaves of the last carry have a gradient.
-        outputs: which outputs have one.
-    """
+    """Find out what an adjoint depends on by a step in plain torch, with all passes of loops."""
 
     def leaf(x: Tensor) -> Tensor:
         return x.detach().requires_grad_(x.is_floating_point())
@@ -240,11 +222,7 @@ _USUAL = frozenset(_NAMES.split())
 
 
 class _Cut(TorchFunctionMode):
-    """Context that notes whether something cuts a derivative that goes through other operations.
-
-    Attributes:
-        met: whether it was so.
-    """
+    """Context that notes whether something cuts a derivative that goes through other operations."""
 
     met = False
 
@@ -274,14 +252,7 @@ _Seen.__torch_dispatch__ = _Seen._dispatch  # type: ignore[assignment]
 
 
 class Substituted(TorchFunctionMode):
-    """Context: in place of some tensors, wherever a function of torch meets them, it is given others.
-
-    Args:
-        others: by the identities of those that they replace.
-
-    Attributes:
-        unmet: identities of those that no function met.
-    """
+    """Context: in place of some tensors, wherever a function of torch meets them, it is given others."""
 
     def __init__(self, others: dict[int, Tensor]) -> None:
         super().__init__()
@@ -318,12 +289,6 @@ def reversed_program(
     """Return the program of the adjoint: carry, inputs and outputs as of `steps.adjoint_step`.
 
     In the place of captured tensors and slopes by them it has numbers of the table.
-
-    Args:
-        program: of the step.
-        wanted: for which there are gradients.
-        numbers: of the table that have slopes: where each run of them begins, and its length.
-        rows: inputs that a row has once, before rows' own numbers.
     """
     old, layout, following, outputs = program
     carries = len(layout.carries)

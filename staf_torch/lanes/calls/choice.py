@@ -73,11 +73,8 @@ def undecided(compile: bool | str = "auto", states: Tensor | None = None) -> boo
 def worth(pays: bool, states: Tensor | None = None) -> bool:
     """Return whether an automatic choice falls on compiled code.
 
-    Args:
-        pays: whether a call pays for a compiler on the processor.
-        states: of a loop, which on a device always pays: plain torch there waits for a launch at every
-            operation, some hundred times as long as the operation takes; on the meta device nothing takes
-            time.
+    A loop of ``states`` on a device always pays: plain torch there waits for a launch at every operation,
+    some hundred times as long as the operation takes. On the meta device nothing takes time.
     """
     if states is not None and states.is_meta:
         return False
@@ -108,16 +105,8 @@ class RepaysError(Exception):
 class PlainTime(TorchFunctionMode):
     """Context: counts the operations of torch inside of it.
 
-    Args:
-        times: of a loop of which this is one step, to be broken off where all of them repay a compiler; 0
-            for none.
-
-    Attributes:
-        operations: their number, more for those inside of a transform of torch.func.
-        entries: that they made.
-
-    Raises:
-        RepaysError: as soon as the loop is known to take `GAIN` times as long as a compiler.
+    Of one step of a loop it raises RepaysError as soon as all ``times`` are known to take `GAIN` times as
+    long as a compiler.
     """
 
     def __init__(self, times: int = 0) -> None:
@@ -158,13 +147,7 @@ _spent: dict[Hashable, tuple[int, float]] = {}  # calls of a kind, and s that th
 
 
 class ShortCall:
-    """Context of a call that `auto` leaves in plain torch as it is short.
-
-    Args:
-        name: of what is called, in the log.
-        kind: tells calls apart that other programs would serve.
-        remedy: what compiles it.
-    """
+    """Context of a call that `auto` leaves in plain torch as it is short."""
 
     def __init__(self, name: str, kind: Hashable, remedy: str = "") -> None:
         self._name, self._kind, self._remedy = name, (name, kind), remedy

@@ -51,9 +51,7 @@ def ordinary(leaves: Sequence[Any], *, recorded: bool | None = None) -> Where:
     All that is given to compiled code passes here: dense, `readable`, on the CPU or one CUDA device. Under a
     tracer, a transform of torch.func or another mode the operations themselves are wanted.
 
-    Args:
-        leaves: the tensors, `Shared` ones among them.
-        recorded: whether one that requires a gradient is refused; None where autograd is on.
+    Where ``recorded``, by default where autograd is on, one that requires a gradient is refused.
     """
     if seen_by_others():
         return False

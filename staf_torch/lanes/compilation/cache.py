@@ -19,16 +19,11 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-try:
-    import fcntl
-except ImportError:  # no POSIX
-    fcntl = None  # type: ignore[assignment]
-
 _log = logging.getLogger(__name__)
 LARGEST = 2**30
 """Bytes that the cache may hold: a trace is some 15 kilobytes, a library 30."""
 _SCRATCH = tempfile.gettempprefix()  # of names under which a file is written at first
-_BEGUN, _HOUR, _DAY = 1.0, 3600.0, 86_400.0
+_DAY = 86_400.0
 _LONGEST_UNUSED = 60 * _DAY
 _temporary: dict[int, Path] = {}  # caches, by the process that made them
 
@@ -89,48 +84,15 @@ _OURS = 0o755  # also where the user's umask lets a group write
 
 @contextlib.contextmanager
 def scratch(folder: Path) -> Iterator[Path]:
-    """Context: a folder in a cache where a file is made; it is gone in the end, at the latest for `prune`.
-
-    It is locked as long as this process lives: one that nobody locks was left by a process that was killed.
-    """
+    """Context: a folder in a cache where a file is made; it is gone in the end, at the latest for `prune`."""
     with tempfile.TemporaryDirectory(dir=folder) as place:
-        lock = os.open(place, os.O_RDONLY)
-        try:
-            _lock(lock)
-            yield Path(place)
-        finally:
-            os.close(lock)
+        yield Path(place)
 
 
 def publish(made: Path, path: Path) -> None:
     """Give a file its name in the cache, where nobody else may write to it."""
     made.chmod(_OURS & (made.stat().st_mode | stat.S_IWUSR))
     os.replace(made, path)
-
-
-def _lock(file: int) -> bool | None:
-    """Lock an open file or folder: False where somebody else has, None where the file system cannot."""
-    if fcntl is None:
-        return None
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:
-        return None
-    return True
-
-
-def _left_over(path: Path, age: float) -> bool:
-    """Return whether the process that made a scratch folder or file has been killed."""
-    if not path.is_dir() or age < _BEGUN:
-        return age > _HOUR
-    file = os.open(path, os.O_RDONLY)
-    try:
-        free = _lock(file)
-    finally:
-        os.close(file)
-    return age > _DAY if free is None else free
 
 
 def used(path: Path) -> None:
@@ -142,14 +104,8 @@ def used(path: Path) -> None:
 def prune(folder: Path, *, now: float | None = None, largest: int = LARGEST) -> None:
     """Delete files of the cache that nobody has used for long, and the oldest while there are too many bytes.
 
-    What was used within a day stays in any case: another process may be about to load it. A library that a
-    process has loaded stays with that process. Names that this library did not give are left alone. What a
-    compiler or a process has left that was killed goes at once.
-
-    Args:
-        folder: of the cache.
-        now: in seconds; the present by default.
-        largest: bytes that may stay.
+    What was used within a day stays in any case: another process may be about to load it, or is making it. A
+    library that a process has loaded stays with that process. Other names are left alone.
     """
     now = time.time() if now is None else now
     found = list[tuple[float, int, Path]]()
@@ -162,11 +118,8 @@ def prune(folder: Path, *, now: float | None = None, largest: int = LARGEST) -> 
     kept = sum(size for _, size, _ in found)
     for last_use, size, path in sorted(found):
         unused = now - last_use
-        if path.name.startswith(_SCRATCH):
-            with contextlib.suppress(OSError):
-                if not _left_over(path, unused):
-                    continue
-        elif unused <= _LONGEST_UNUSED and (unused <= _DAY or kept <= largest):
+        longest = _DAY if path.name.startswith(_SCRATCH) else _LONGEST_UNUSED  # left by what was killed
+        if unused <= longest and (unused <= _DAY or kept <= largest):
             continue
         kept -= size
         if path.is_dir():

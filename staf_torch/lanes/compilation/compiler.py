@@ -50,10 +50,8 @@ _programs: dict[str, Callable[..., None]] = {}  # by their text
 def compiled(source: Path, *definitions: str) -> Callable[..., None] | None:
     """Return the function ``staf_<name>`` of ``_<name>.cpp``; None, logged once, where none can be built.
 
-    Args:
-        source: the file, which finds the headers of its folder and of this one by their names.
-        definitions: of the preprocessor, NAME=value: what is built is for these alone, and built in about
-            a second.
+    It finds headers of its folder and of this one by their names. What is built for ``definitions`` of the
+    preprocessor, NAME=value, is for these alone.
     """
     name = source.stem.removeprefix("_")
     options = (*_OF_FILES, *(f"-D{each}" for each in definitions))

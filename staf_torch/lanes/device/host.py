@@ -156,13 +156,7 @@ class HostDevice:
             return found
 
     def launch(self, kernel: Any, arguments: ctypes.Array[ctypes.c_char], rows: int) -> None:
-        """Run a kernel for so many rows.
-
-        Args:
-            kernel: of `compile`.
-            arguments: its structure.
-            rows: at least 1.
-        """
+        """Run a kernel for so many rows."""
         sizes = -(-rows // _BLOCK), _BLOCK
         if _launches is not None:
             copy = ctypes.create_string_buffer(arguments.raw, len(arguments))

@@ -64,11 +64,8 @@ def device(where: torch.device) -> Device:
 def kernel_text(source: str, *, unit: bool, wide: bool, far: bool) -> str:
     """Return the text of a kernel for a kind of inputs.
 
-    Args:
-        source: of `emit_cuda`.
-        unit: whether the entries of every input lie side by side.
-        wide: whether offsets take 64 bits.
-        far: whether its table lies in memory although it is short enough for the arguments.
+    Entries of every input lie side by side (``unit``), offsets take 64 bits (``wide``), its table lies in
+    memory although it is short enough for the arguments (``far``).
     """
     head = ["#define UNIT"] if unit else []
     head += ["#define FAR"] if far else []
@@ -286,18 +283,8 @@ def in_chunks(
 ) -> list[Tensor] | None:
     """Return the carry after the last step, on the device, and the outputs, on the processor.
 
-    Args:
-        call: takes so many steps of inputs.
-        leaves: the inputs, the carry last.
-        times: for each of them, whether it has times.
-        rooms: of all results, the carry first.
-        carries: how many results are the carry.
-        steps, every: of the whole call.
-        free: bytes that are free on the device.
-        where: the device.
-
-    Returns:
-        None where a single time does not fit, or the processor has no memory for the outputs.
+    ``leaves`` are the inputs, the carry last, ``rooms`` those of all results, the carry first. None where a
+    single time does not fit, or the processor has no memory for the outputs.
     """
     outputs = rooms[carries:]
     size, recorded = sum(room.bytes for room in outputs), max(1, -(-steps // every))

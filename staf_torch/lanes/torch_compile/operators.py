@@ -156,16 +156,7 @@ class TensorForm(NamedTuple):
 
 
 class GraphCall:
-    """A function with all of its arguments but tensors.
-
-    Args:
-        name: of the function.
-        structure: of its arguments, of `taken`.
-        objects: in it.
-        forms: of tensors in it.
-        contents: what the objects hold and lead to.
-        surroundings: of the call.
-    """
+    """A function with all of its arguments but tensors."""
 
     def __init__(
         self,
@@ -262,11 +253,7 @@ class _TicketMemory(bytearray):
 
 
 class Surroundings:
-    """The modes of torch, whether it records, casts or transforms operations, where a graph was read.
-
-    Args:
-        recorded: whether autograd is on.
-    """
+    """The modes of torch, whether it records, casts or transforms operations, where a graph was read."""
 
     def __init__(self, recorded: bool) -> None:
         self.recorded = recorded
