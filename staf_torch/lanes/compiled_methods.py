@@ -41,7 +41,6 @@ from .trace.row_independence import generators
 from .tree import Shared, Tree, flatten, plain
 
 _PAYS = 100  # calls of a small batch in plain torch after which it is compiled, however short they are
-_SOON = 30  # calls
 _KEPT = 64  # shapes of calls that are remembered
 _is_exporting = getattr(torch.compiler, "is_exporting", torch.compiler.is_compiling)  # torch 2.6 has none
 
@@ -288,14 +287,6 @@ class CompiledMethod:
         """Return whether a compiled program has served a call."""
         return self._served is not None and self._served.compiled
 
-    @property
-    def compiles_soon(self) -> bool:
-        """Return whether it has run in plain torch, and some more calls like the first will compile it."""
-        if self._served is not None or self._plain is None or not undecided():
-            return False
-        most, (plain, _) = self._settings.pays, self._plain
-        return most - self._asked <= _SOON * (1 + most * plain.seconds() / plain.build)
-
     def hasten(self) -> None:
         """Compile at the next call, whatever it pays."""
         self._asked, self.waits = math.inf, True
@@ -378,7 +369,7 @@ class LoopProgram:
         compiled: makes the compiled one; None where there is none.
         times: of the loop, all calls together.
         remedy: what makes it faster, for the log.
-        parts: of the loop; while a method of one will soon be compiled by itself, nobody knows the rest.
+        parts: of the loop, of whose classes other programs would be.
     """
 
     def __init__(
@@ -395,7 +386,6 @@ class LoopProgram:
         self._compiled: Program | None = None
         self._sign = Sign(f"{plain.name} in plain torch", times)
         self._done, self._spent, self._fastest, self._said = 0, 0.0, math.inf, False
-        self._parts, self._waited = parts, False
         self._counted = 0  # rows, one after the other, of which a step was counted
         self._short = ShortCall(plain.name, tuple(map(type, parts)), "`compile=True`" if remedy else "")
 
@@ -440,11 +430,6 @@ class LoopProgram:
         self._sign.advance()
         self._fastest = min(self._fastest, seconds)
         if self._said or self._done < 2 or self._spent < _SAID:
-            return
-        methods = [method for part in self._parts for method in methods_of(part)]
-        waited, self._waited = self._waited, any(method.compiles_soon for method in methods)
-        if waited or self._waited:  # or in the step after the last one was compiled
-            self._fastest = math.inf
             return
         rest = self._fastest * (self._times * one_by_one() - self._done)
         if rest < _LONG:

@@ -30,7 +30,7 @@ from .adjoint.carries import carried
 from .adjoint.steps import ReversedStep
 from .calls.inputs import Given
 from .calls.planned_call import Compiled
-from .compilation.cache import cache, found, publish, scratch, used
+from .compilation.cache import cache, found, keep, kept
 from .compilation.compiler import REVERSED
 from .dependencies.contents import Contents
 from .dependencies.walk import is_users
@@ -92,35 +92,29 @@ def known(step: Step, described: tuple[bytes, Sequence[Tensor]] | None, given: G
 
 
 def written(step: Step, given: Given, form: Form) -> Trace:
+    """Return the trace of a step with a single row."""
     real = given.real
     if not isinstance(form, int):
         traced = _traced(step, given)
-        text = kernel(traced, given)
-        return _record(text, traced, real)
+        return _record(kernel(traced, given), traced, real)
     try:
         traced = _traced(step, given)
-        text = _emitted(step, traced, form)
+        text = emit(*traced.program, form)
     except NotLoweredError:
         if real == torch.float64:
             raise
         # float64 within a program of float32: all of it in double, rounded where it ends.
-        real = torch.float64
-        traced = _traced(step, given, widened=True)
-        text = _emitted(step, traced, form)
+        real, traced = torch.float64, _traced(step, given, widened=True)
+        text = emit(*traced.program, form)
+    if isinstance(step, ReversedStep):
+        text = text._replace(source=f"{REVERSED}\n{text.source}")
     return _record(text, traced, real)
 
 
-def _emitted(step: Step, traced: Traced, form: int) -> Text:
-    text = emit(*traced.program, form)
-    return text._replace(source=f"{REVERSED}\n{text.source}") if isinstance(step, ReversedStep) else text
-
-
 def _traced(step: Step, given: Given, *, widened: bool = False) -> Traced:
-    return (
-        step.traced(given, widened=widened)
-        if isinstance(step, ReversedStep)
-        else trace(step, given, widened=widened)
-    )
+    if isinstance(step, ReversedStep):
+        return step.traced(given, widened=widened)
+    return trace(step, given, widened=widened)
 
 
 def _record(text: Text, traced: Traced, real: torch.dtype) -> Trace:
@@ -136,7 +130,6 @@ def kernel(traced: Traced, given: Given) -> Text:
 
 
 _FOLDER = Path(__file__).parents[1]  # of the package
-_DIGEST = 32
 _NUMPY = [(f"numpy.{core}.multiarray", "_reconstruct") for core in ("core", "_core")]
 _NUMPY += [(f"numpy.{core}.numeric", "_frombuffer") for core in ("core", "_core")]
 _ALLOWED = {("torch", "Size"), ("torch", "device"), ("numpy", "dtype"), ("numpy", "ndarray"), *_NUMPY}
@@ -179,11 +172,10 @@ def load(path: Path, tensors: Sequence[Tensor]) -> Trace | None:
     """Return a trace with the numbers that follow from other tensors, as `save` had them; None without."""
     try:
         path = next(found(path.name), path)
-        content = path.read_bytes()
-        used(path)
-        if content[-_DIGEST:] != hashlib.sha256(content[:-_DIGEST]).digest():
+        content = kept(path)
+        if content is None:
             return None
-        trace = Trace(*_TraceReader(io.BytesIO(zlib.decompress(content[:-_DIGEST])), tensors).load())
+        trace = Trace(*_TraceReader(io.BytesIO(zlib.decompress(content)), tensors).load())
     except _DAMAGED:
         return None
     numbers = trace.recipe.again({id(tensor): tensor for tensor in tensors})
@@ -199,11 +191,7 @@ def save(path: Path, trace: Trace, tensors: Sequence[Tensor]) -> None:
     try:
         numberless = trace.recipe._replace(values=torch.empty(0, dtype=torch.float64, device="cpu"))
         _TraceWriter(file, places, numberless).dump(tuple(trace._replace(recipe=numberless)))
-        content = zlib.compress(file.getvalue(), level=1)  # 100 kilobytes to 15
-        # Under a name of its own first: another process may be writing the same.
-        with scratch(path.parent) as folder:
-            (folder / path.name).write_bytes(content + hashlib.sha256(content).digest())
-            publish(folder / path.name, path)
+        keep(path, zlib.compress(file.getvalue(), level=1))  # 100 kilobytes to 15
     except (OSError, pickle.PicklingError, TypeError, AttributeError):
         return  # it is traced again another time
 

@@ -394,7 +394,6 @@ def _work(source: str) -> int | None:
 
 
 _GROWN = 1e12  # times what a gradient is of, from which on it is reported
-_FEW = 8  # rows of what gradients are made from, by which that is judged at first
 _log = logging.getLogger(__name__)
 _said: set[str] = set()  # programs of which it was
 
@@ -417,10 +416,7 @@ def grown(program: str, ends: Sequence[Tensor], found: Sequence[Tensor]) -> bool
     if program in _said or not ends or any(x.is_meta or not x.is_cpu or wrapped(x) for x in (*ends, *found)):
         return False
     rows = max(1, len(ends[0]))
-    few = _sum([end[:: rows // _FEW + 1] for end in ends])  # all of them are no less
-    if few == few and not any(_beyond(part, _GROWN * few / rows) for part in found if part.numel()):
-        return False
-    came = _sum(ends)
+    came = sum([float(torch.linalg.vector_norm(end, 1)) for end in ends])
     if came != came:
         came = sum([float(end.abs().nansum()) for end in ends])
     most = _GROWN * came / rows
@@ -453,10 +449,6 @@ def say_grown(program: str, ends: Sequence[Tensor], slopes: Sequence[Slope]) -> 
         "more inner steps, or fewer times (`detach` between them). Said once."
     )
     _log.warning(told, program, most, where, most / total)
-
-
-def _sum(ends: Sequence[Tensor]) -> float:
-    return sum([float(torch.linalg.vector_norm(end, 1)) for end in ends])
 
 
 def _beyond(x: Tensor, most: float) -> bool:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import atexit
 import contextlib
 import functools
+import hashlib
 import logging
 import os
 import shutil
@@ -23,7 +24,7 @@ _log = logging.getLogger(__name__)
 LARGEST = 2**30
 """Bytes that the cache may hold: a trace is some 15 kilobytes, a library 30."""
 _SCRATCH = tempfile.gettempprefix()  # of names under which a file is written at first
-_DAY = 86_400.0
+_DAY, _DIGEST = 86_400.0, 32
 _LONGEST_UNUSED = 60 * _DAY
 _temporary: dict[int, Path] = {}  # caches, by the process that made them
 
@@ -95,10 +96,24 @@ def publish(made: Path, path: Path) -> None:
     os.replace(made, path)
 
 
-def used(path: Path) -> None:
-    """Note that a file of the cache is in use now, which `prune` goes by."""
-    with contextlib.suppress(OSError):  # there is none, or it belongs to somebody else
-        os.utime(path)
+def keep(path: Path, content: bytes) -> None:
+    """Write a file of the cache, which ends with its digest: under another name first, as another process may
+    be writing the same."""
+    with scratch(path.parent) as folder:
+        (folder / path.name).write_bytes(content + hashlib.sha256(content).digest())
+        publish(folder / path.name, path)
+
+
+def kept(path: Path) -> bytes | None:
+    """Return what `keep` has written, None of another or half a file; it counts as used now for `prune`."""
+    try:
+        content = path.read_bytes()
+        with contextlib.suppress(OSError):  # it belongs to somebody else
+            os.utime(path)
+    except OSError:
+        return None
+    content, digest = content[:-_DIGEST], content[-_DIGEST:]
+    return content if digest == hashlib.sha256(content).digest() else None
 
 
 def prune(folder: Path, *, now: float | None = None, largest: int = LARGEST) -> None:
@@ -115,13 +130,13 @@ def prune(folder: Path, *, now: float | None = None, largest: int = LARGEST) -> 
                 with contextlib.suppress(OSError):  # deleted by another process
                     state = entry.stat()
                     found.append((state.st_mtime, state.st_size, Path(entry.path)))
-    kept = sum(size for _, size, _ in found)
+    held = sum(size for _, size, _ in found)
     for last_use, size, path in sorted(found):
         unused = now - last_use
         longest = _DAY if path.name.startswith(_SCRATCH) else _LONGEST_UNUSED  # left by what was killed
-        if unused <= longest and (unused <= _DAY or kept <= largest):
+        if unused <= longest and (unused <= _DAY or held <= largest):
             continue
-        kept -= size
+        held -= size
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)
         else:

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from ...signs import Sign
 from ..threads import Mutex
-from .cache import cache, found, publish, scratch, used
+from .cache import cache, found, keep, kept, scratch
 
 COMPILERS = ("g++", "c++", "clang++")
 """Names that are looked for where `CXX` names none."""
@@ -40,7 +40,6 @@ _LONG, _OF_LONG = 1500, ("-fira-region=one", "-fno-tree-pre", "-fno-gcse")  # li
 # A reversed step has most numbers alive at once: in another order they fit the registers, a tenth faster.
 _OF_REVERSED = ("-fschedule-insns", "-fsched-pressure")
 _SLOW = 6000  # lines from which a build may take its whole time
-_DIGEST = 32  # bytes at the end of a library in the cache
 _one_at_a_time = Mutex()  # threads of a chase ask for the same at the same time
 _said: set[str] = set()  # what has been logged
 _programs: dict[str, Callable[..., None]] = {}  # by their text
@@ -100,7 +99,7 @@ def library(name: str, text: str, options: tuple[str, ...], folder: Path) -> Pat
     program = find_compiler()
     if program is None:
         for path in found(f"{made_of}-*.so"):
-            if _is_whole(path):
+            if kept(path) is not None:
                 return path
         raise FileNotFoundError(
             f"none of {', '.join(COMPILERS)} is on the path, and the cache has no compiled program"
@@ -113,35 +112,22 @@ def library(name: str, text: str, options: tuple[str, ...], folder: Path) -> Pat
     command = [program, *options, *of_user, *(f"-I{each}" for each in dict.fromkeys((folder, _FOLDER)))]
     file = f"{made_of}-{_digest(*options, *of_user, _version(program))[:8]}.so"
     for path in found(file):
-        if _is_whole(path):
+        if kept(path) is not None:  # half of one would crash the process
             return path
     templates = name != "lanes" and '#include "' in text  # of a file, in its headers
     takes = 10 if templates else 1 + lines / 1600
     sign = Sign(f"compiling {lines} lines, once: some {takes:.0f} s of a processor")
-    # In a folder of its own first: another process may be building the same.
     path = cache() / file
     with sign, scratch(path.parent) as place:
         source, built = place / f"{name}.cpp", place / path.name
         source.write_text(text, encoding="utf-8")
         run([*command, str(source), "-o", str(built)], short=lines < _SLOW)
-        with built.open("ab") as shared:  # a digest, which a loader of shared objects does not look at
-            shared.write(hashlib.sha256(built.read_bytes()).digest())
-        publish(built, path)
+        keep(path, built.read_bytes())  # with a digest, which a loader of shared objects does not look at
     return path
 
 
 def _digest(*parts: str) -> str:
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
-
-
-def _is_whole(library: Path) -> bool:
-    """Return whether a library is there and ends with its own digest: half of one would crash the process."""
-    try:
-        used(library)
-        content = library.read_bytes()
-    except OSError:
-        return False
-    return content[-_DIGEST:] == hashlib.sha256(content[:-_DIGEST]).digest()
 
 
 @functools.cache

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import torch
 
 from ...signs import Sign
-from ..compilation.cache import cache, found, publish, scratch, used
+from ..compilation.cache import cache, found, keep, kept
 from ..emit.cuda import FEWER_REGISTERS, KERNEL, with_shared_memory
 from ..threads import Mutex
 
@@ -33,13 +33,12 @@ _OPTIONS = ("--std=c++17", "--fmad=false", "--ptxas-options=-v")
 _STACK = re.compile(r"(\d+) bytes stack frame, (\d+) bytes spill stores")
 _USED, _SHARED = re.compile(r"Used (\d+) registers"), re.compile(r"(\d+) bytes smem")
 _REGISTERS, _STEP, _WARPS = 512, 8, 16  # that warps share of a lane, are given at once; warps at most
-_DIGEST = 32
 _SHARED_SPILLS = 13000  # the first version of CUDA that keeps in shared memory what registers lack room for
 _LONG_ARGUMENTS = 12010  # the first version of CUDA of which a kernel's arguments may take 32764 bytes
 _WARP, _BLOCK = 32, 128
 _FEW = 8  # warps a multiprocessor up to which every warp is a block, so that all multiprocessors have some
 _NO_CONTEXT = (3, 201)  # not initialised, invalid context
-_MOST_THREADS, _NUMBER_OF_REGISTERS, _LOCAL_BYTES = 0, 4, 3  # attributes of a function
+_MOST_THREADS = 0  # an attribute of a function
 _lock = Mutex()
 
 
@@ -113,14 +112,6 @@ class CudaDevice:
         kept = torch.cuda.memory_reserved(self.index) - torch.cuda.memory_allocated(self.index)
         return int(torch.cuda.mem_get_info(self.index)[0]) + kept
 
-    def attributes(self, text: str) -> dict[str, int]:
-        """Return the registers of a thread and the bytes of memory of its own, of a kernel."""
-        kernel, value, read = self.compile(text), ctypes.c_int(), {}
-        for name, number in (("registers", _NUMBER_OF_REGISTERS), ("local", _LOCAL_BYTES)):
-            _checked(_driver().cuFuncGetAttribute(ctypes.byref(value), number, kernel))
-            read[name] = value.value
-        return read
-
     def launch(self, kernel: LoadedKernel, arguments: ctypes.Array[ctypes.c_char], rows: int) -> None:
         """Put a kernel for so many rows on the stream that torch has on this device now."""
         if torch._C._cuda_getDevice() != self.index:
@@ -180,19 +171,15 @@ def machine_code(text: str, architecture: int) -> bytes:
     made_of = f"kernel-{_digest(*parts)[:24]}"
     names = f"{made_of}-{_digest(version)[:8]}.cubin" if compiler is not None else f"{made_of}-*.cubin"
     for path in found(names):
-        content = path.read_bytes()
-        if content[-_DIGEST:] == hashlib.sha256(content[:-_DIGEST]).digest():
-            used(path)
-            return content[:-_DIGEST]
+        code = kept(path)
+        if code is not None:
+            return code
     if compiler is None:
         raise OSError(f"the CUDA compiler (NVRTC) was not found: {REMEDY}")
     lines = text.count("\n")
     with Sign(f"compiling {lines} lines for sm_{architecture}, once"):
         code = compiler.compile(text, architecture)
-    path = cache() / names
-    with scratch(path.parent) as place:
-        (place / path.name).write_bytes(code + hashlib.sha256(code).digest())
-        publish(place / path.name, path)
+    keep(cache() / names, code)
     return code
 
 

@@ -11,10 +11,9 @@ import ctypes
 import functools
 import logging
 import math
-import os
 import struct
 from collections.abc import Callable, Collection, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -32,45 +31,14 @@ _MOST = 2**31 - 1  # of an offset of 32 bits
 _OTHERS = 2048  # bytes of a kernel's arguments that are kept for others than its table
 
 
-class Device(Protocol):
-    """Interface of a device that runs kernels."""
-
-    def compile(self, text: str) -> Any:
-        """Return the kernel of a text; raises OSError where it cannot."""
-
-    def launch(self, kernel: Any, arguments: ctypes.Array[ctypes.c_char], rows: int) -> None:
-        """Start a kernel for so many rows, with this structure."""
-
-    def arguments(self) -> int:
-        """Return the bytes that the arguments of a kernel may take."""
-
-    def memory(self) -> int:
-        """Return the bytes of all its memory."""
-
-    def free(self) -> int:
-        """Return the bytes that are free."""
-
-
 @functools.cache
-def device(where: torch.device) -> Device:
+def device(where: torch.device) -> HostDevice | CudaDevice:
     """Return what runs the kernels of tensors there.
 
     Raises:
         OSError: if the driver is missing.
     """
     return HostDevice() if where.type == "cpu" else CudaDevice(where.index)
-
-
-def kernel_text(source: str, *, unit: bool, wide: bool, far: bool) -> str:
-    """Return the text of a kernel for a kind of inputs.
-
-    Entries of every input lie side by side (``unit``), offsets take 64 bits (``wide``), its table lies in
-    memory although it is short enough for the arguments (``far``).
-    """
-    head = ["#define UNIT"] if unit else []
-    head += ["#define FAR"] if far else []
-    head += ["#define OFFSET long long"] if wide else []
-    return "\n".join([*head, source])
 
 
 class DeviceCall:
@@ -140,7 +108,9 @@ class DeviceCall:
         near = in_arguments(table.numel(), table.dtype == torch.float32)
         self._near = near and table.nbytes <= room
         far = near and not self._near
-        self.text = kernel_text(compiled.call, unit=unit, wide=wide, far=far)
+        kinds = (unit, "UNIT"), (far, "FAR"), (wide, "OFFSET long long")
+        head = [f"#define {text}" for holds, text in kinds if holds]
+        self.text = "\n".join([*head, compiled.call])
         self._kernel = self._device.compile(self.text)
         self._arguments(read, rows, steps, every)
 
@@ -331,10 +301,6 @@ def _available() -> float:
             found = next(line for line in lines if line.startswith("MemAvailable"))
         return 1024.0 * int(found.split()[1])
     except (OSError, StopIteration, ValueError):
-        pass
-    try:
-        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    except (AttributeError, OSError, ValueError):
         return math.inf
 
 
