@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import logging
-import os
 import re
 import shutil
 import tempfile
@@ -38,7 +37,7 @@ from .controllers import (
     searches,
 )
 from .data_sheet import Latency, Source, counted
-from .formats import Run, as_tuple
+from .formats import Run, as_tuple, found_compiler
 from .remembered_policy import RememberedPolicy
 
 _log = logging.getLogger(__name__)
@@ -358,11 +357,9 @@ def need_c_compiler() -> str:
     Raises:
         ValueError: if there is none.
     """
-    wanted = os.environ.get("CC")
-    compiler = wanted or next((c for c in ("cc", "gcc", "g++", "clang") if shutil.which(c)), None)
-    if compiler is None or shutil.which(compiler) is None:
-        raise ValueError(
-            "The C header is compiled once to compare it with the library, and there is no C compiler here: "
-            f"install gcc, or name one in the variable CC; got {compiler!r}."
-        )
-    return compiler
+    return found_compiler(
+        "CC",
+        ("cc", "gcc", "g++", "clang"),
+        "The C header is compiled once to compare it with the library, and there is no C compiler here: "
+        "install gcc, or name one in the variable CC",
+    )

@@ -60,18 +60,10 @@ class Work:
 
 
 _FUNCTIONS = {"exp", "expm1", "sin", "cos", "tanh", "sqrt", "rsqrt", "pow", "log", "log1p", "atan", "sigmoid"}
-_FREE = {"view", "slice", "select", "unsqueeze", "squeeze", "expand", "permute", "transpose", "cat", "clone"}
-_FREE |= {"full", "scalar_tensor", "empty", "ones_like", "zeros_like", "full_like", "new_ones", "new_zeros"}
-_FREE |= {
-    "alias",
-    "split_with_sizes",
-    "getitem",
-    "reshape",
-    "arange",
-    "t",
-    "_unsafe_view",
-    "copy",
-    "_to_copy",
+_FREE = {
+    *("view", "slice", "select", "unsqueeze", "squeeze", "expand", "permute", "transpose", "cat", "clone"),
+    *("full", "scalar_tensor", "empty", "ones_like", "zeros_like", "full_like", "new_ones", "new_zeros"),
+    *("alias", "split_with_sizes", "getitem", "reshape", "arange", "t", "_unsafe_view", "copy", "_to_copy"),
 }
 
 

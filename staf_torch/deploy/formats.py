@@ -57,12 +57,21 @@ def need_compiler() -> None:
     Raises:
         ValueError: that says what to install.
     """
-    compiler = os.environ.get("CXX") or next((c for c in ("g++", "clang++") if shutil.which(c)), None)
-    if compiler is None or shutil.which(compiler) is None:
-        raise ValueError(
-            "AOTInductor compiles C++, and there is no compiler here: install g++ (apt-get install g++) "
-            f"or name one in the variable CXX; got {compiler!r}. ONNX and pt2 need none."
-        )
+    found_compiler(
+        "CXX",
+        ("g++", "clang++"),
+        "AOTInductor compiles C++, and there is no compiler here: install g++ (apt-get install g++) "
+        "or name one in the variable CXX",
+        " ONNX and pt2 need none.",
+    )
+
+
+def found_compiler(variable: str, names: Sequence[str], rule: str, beside: str = "") -> str:
+    """Return the compiler that a variable of the environment names, else the first of these that is here."""
+    found = os.environ.get(variable) or next(filter(shutil.which, names), None)
+    if found is None or shutil.which(found) is None:
+        raise ValueError(f"{rule}; got {found!r}.{beside}")
+    return found
 
 
 def trace(module: nn.Module, example: Tensor, *, batch: int | None = None) -> ExportedProgram:

@@ -118,20 +118,13 @@ class RememberedPolicy(nn.Module):
         tables = [_table(real, f"{name}_{each}", getattr(self, each), real == "float") for each in floats]
         whole = ("first", "last", "end")
         tables += [_table("int", f"{name}_{each}", getattr(self, each), False) for each in whole]
-        sizes = {
-            **{
-                "NAME": name,
-                "REAL": real,
-                "N": n,
-                "M": m,
-                "WIDTH": self.plans.shape[1],
-                "MODEL": self.models.shape[1],
-            },
-            **{"S": len(self.searched), "J": len(self.first) - 1, "K": self.candidates, "H": self.lookahead},
-            **{"ROUND": "rintf" if real == "float" else "rint", "CONTROL": output},
-            "GOAL": ", ".join(repr(float(g)) for g in self.problem.goal),
-            "PERIOD": ", ".join(repr(2 * math.pi) if i in self.problem.periodic else "0" for i in range(n)),
-        }
+        sizes: dict[str, object] = {"NAME": name, "REAL": real, "CONTROL": output, "N": n, "M": m}
+        sizes |= {"WIDTH": self.plans.shape[1], "MODEL": self.models.shape[1], "S": len(self.searched)}
+        sizes |= {"J": len(self.first) - 1, "K": self.candidates, "H": self.lookahead}
+        sizes["ROUND"] = "rintf" if real == "float" else "rint"
+        sizes["GOAL"] = ", ".join(repr(float(g)) for g in self.problem.goal)
+        turns = (repr(2 * math.pi) if i in self.problem.periodic else "0" for i in range(n))
+        sizes["PERIOD"] = ", ".join(turns)
         text = _SEARCH
         for each, value in sizes.items():
             text = text.replace(f"@{each}@", str(value))

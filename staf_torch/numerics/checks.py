@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
+import operator
 from collections.abc import Callable, Collection, Sequence
 from typing import Any, TypeVar
 
@@ -56,18 +57,14 @@ def non_negative(call: str, name: str, value: object) -> Tensor:
     return _tensor(_signed(call, name, number(call, name, value), "not negative", value))
 
 
-_SIGNS: dict[str, tuple[Callable[[Any], Any], str]] = {
-    "positive": (lambda x: x > 0, "must be positive"),
-    "not negative": (lambda x: x >= 0, "must not be negative"),
-}
-
-
 def _signed(call: str, name: str, checked: float | Tensor, sign: str, value: object) -> float | Tensor:
     """Return a number or a tensor of them whose sign is right; ``value`` is what was given."""
-    holds, rule = _SIGNS[sign]
+    holds, rule = operator.gt, "must be positive"
+    if sign == "not negative":
+        holds, rule = operator.ge, "must not be negative"
     if isinstance(checked, Tensor):
-        return _in_all_rows(call, name, checked, holds, rule, value)
-    if not holds(checked):
+        return _in_all_rows(call, name, checked, lambda x: holds(x, 0), rule, value)
+    if not holds(checked, 0):
         raise fail(call, name, rule, value)
     return checked
 
@@ -116,8 +113,7 @@ def keep(module: nn.Module, name: str, value: Any) -> Any:
 def positive_real(call: str, name: str, value: object) -> float:
     """A positive Python number."""
     checked = real(call, name, value)
-    if checked <= 0:
-        raise fail(call, name, "must be positive", value)
+    _signed(call, name, checked, "positive", value)
     return checked
 
 
@@ -222,29 +218,21 @@ def trailing(
     Numbers of another kind are never rounded or converted without a word: the error says what to write.
     """
     if isinstance(value, Tensor):
-        if value.dtype not in _FLOATS or value.layout is not _DENSE:
+        if value.dtype not in _FLOATS or value.layout is not _DENSE or value.is_nested:
             raise _not_dense(call, name, value)
-        try:
-            shape = value.shape
-        except RuntimeError as error:
-            raise _not_dense(call, name, value) from error
+        what, shape = f"`{call}({name}=...)`", value.shape
         if len(shape) < dims:
-            raise ValueError(
-                f"`{call}({name}=...)` must have at least {dims} dimension{'s' * (dims > 1)}; got the shape "
-                f"{tuple(shape)}."
-            )
+            least = f"at least {dims} dimension{'s' * (dims > 1)}"
+            raise ValueError(f"{what} must have {least}; got the shape {tuple(shape)}.")
         if last is not None and shape[-1] != last:
             raise ValueError(
-                f"`{call}({name}=...)` must have {last} entries in its last dimension; "
-                f"got the shape {tuple(shape)}."
+                f"{what} must have {last} entries in its last dimension; got the shape {tuple(shape)}."
             )
         if not meta and value.is_meta:
-            raise ValueError(
-                f"`{call}({name}=...)` must have numbers, which decide here; got one on the device meta."
-            )
+            raise ValueError(f"{what} must have numbers, which decide here; got one on the device meta.")
         if not vmap and torch._C._functorch.is_batchedtensor(value):
             rule = "must hold all rows at once, and not one by one as under `torch.func.vmap`"
-            raise ValueError(f"`{call}({name}=...)` {rule}; flatten its dimension into the rows.")
+            raise ValueError(f"{what} {rule}; flatten its dimension into the rows.")
         return value
     write = "torch.as_tensor(x, dtype=torch.float64)"
     if hasattr(value, "__array__") and hasattr(value, "dtype"):
@@ -281,8 +269,6 @@ def _not_dense(call: str, name: str, value: Tensor) -> ValueError:
     """The error for numbers that are no floating point, or lie another way than one after the other."""
     if value.is_nested:
         return ValueError(f"`{call}({name}=...)` must be one dense tensor; got a nested one: stack its rows.")
-    if value.is_quantized:
-        return ValueError(f"`{call}({name}=...)` must be dense; got {value.dtype}: write `.dequantize()`.")
     if value.dtype not in _FLOATS:
         write = ".real.double()" if value.is_complex() else ".double()"
         rule = f"must be a floating-point tensor and is {value.dtype}: write `{write}`"

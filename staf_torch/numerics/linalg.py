@@ -37,20 +37,6 @@ def condition_number(gram: Tensor) -> Tensor:
     return torch.where(finite, ratio, torch.nan)
 
 
-def _eigenvalues(call: str, name: str, matrix: Tensor, size: int) -> Tensor | None:
-    """Return the eigenvalues of a matrix, refused if it is not symmetric; None on the meta device."""
-    if matrix.shape != (size, size):
-        raise fail(call, name, f"must be ({size}, {size})", matrix)
-    if matrix.is_meta:
-        return None
-    if not bool(torch.isfinite(matrix).all()):
-        raise fail(call, name, "must be finite", matrix)
-    if bool(((matrix - matrix.mT).abs() > 1e-12 * matrix.abs()).any()):
-        raise fail(call, name, "must be symmetric", matrix)
-    values: Tensor = torch.linalg.eigvalsh(matrix.detach())
-    return values
-
-
 def square(call: str, name: str, value: Matrix, size: int) -> Tensor:
     """A matrix given as itself, by its diagonal, or as a number times the identity: (size, size)."""
     number = non_negative if name == "terminal" else positive  # nothing may be paid at the end
@@ -75,21 +61,25 @@ def square(call: str, name: str, value: Matrix, size: int) -> Tensor:
     return number(call, name, value) * torch.eye(size, dtype=torch.float64, device="cpu")
 
 
-def positive_definite(call: str, name: str, matrix: Tensor, size: int) -> Tensor:
-    """Return a symmetric positive definite (size, size) float64 matrix, anything else refused."""
-    values = _eigenvalues(call, name, matrix, size)
-    if values is not None and bool(values[0] <= 0):
-        raise fail(call, name, "must be positive definite", matrix)
+def positive_definite(call: str, name: str, matrix: Tensor, size: int, *, semi: bool = False) -> Tensor:
+    """Return a symmetric positive definite (size, size) float64 matrix; with ``semi`` a semidefinite one, to
+    1e-12 of its largest eigenvalue. Anything else is refused."""
+    if matrix.shape != (size, size):
+        raise fail(call, name, f"must be ({size}, {size})", matrix)
+    if not matrix.is_meta:
+        if not bool(torch.isfinite(matrix).all()):
+            raise fail(call, name, "must be finite", matrix)
+        if bool(((matrix - matrix.mT).abs() > 1e-12 * matrix.abs()).any()):
+            raise fail(call, name, "must be symmetric", matrix)
+        values = torch.linalg.eigvalsh(matrix.detach())
+        if bool(values[0] < -1e-12 * values.abs().max() if semi else values[0] <= 0):
+            raise fail(call, name, f"must be positive {'semi' * semi}definite", matrix)
     return matrix.to(torch.float64)
 
 
 def positive_semidefinite(call: str, name: str, matrix: Tensor, size: int) -> Tensor:
-    """Return a symmetric positive semidefinite (size, size) float64 matrix, to 1e-12 of its largest
-    eigenvalue; anything else refused."""
-    values = _eigenvalues(call, name, matrix, size)
-    if values is not None and bool(values[0] < -1e-12 * values.abs().max()):
-        raise fail(call, name, "must be positive semidefinite", matrix)
-    return matrix.to(torch.float64)
+    """Return `positive_definite` with ``semi``."""
+    return positive_definite(call, name, matrix, size, semi=True)
 
 
 @designed_on_cpu

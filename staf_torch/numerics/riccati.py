@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor, bmm
+from torch.linalg import inv_ex
 
 from ..lanes import repeat
 from ..lanes.per_row.decisions import in_any_row, is_of_rows
@@ -46,8 +47,8 @@ def continuous_solution(a: Tensor, b: Tensor, q: Tensor, r: Tensor) -> Tensor:
     modes = torch.linalg.eigvals(torch.cat((torch.cat((a, -g), -1), torch.cat((-h, -a.mT), -1)), -2))
     modes = (modes.real.square() + modes.imag.square()).sqrt()  # of the same bits in every batch
     shift = _BESIDE * (modes.amax(-1) * modes.amin(-1)).sqrt()[..., None, None]
-    shifted = _inverse(a - shift * eye)
-    whole = _inverse(a - shift * eye + g @ shifted.mT @ h)
+    shifted = inv_ex(a - shift * eye)[0]
+    whole = inv_ex(a - shift * eye + g @ shifted.mT @ h)[0]
     start = 2 * shift * (shifted @ g @ whole.mT), 2 * shift * (whole.mT @ h @ shifted)
     p = scale * _doubled(eye + 2 * shift * whole, *(0.5 * (each + each.mT) for each in start))
 
@@ -57,7 +58,7 @@ def continuous_solution(a: Tensor, b: Tensor, q: Tensor, r: Tensor) -> Tensor:
         return a - b @ _solve(r, seen.mT), left + left.mT - paid + q, (left, paid, q)
 
     def correction(closed: Tensor, residual: Tensor) -> Tensor:
-        inverse = _inverse(closed - shift * eye)
+        inverse = inv_ex(closed - shift * eye)[0]
         return _summed((closed + shift * eye) @ inverse, 2 * shift * (inverse.mT @ residual @ inverse))
 
     return _refined(p, terms, correction, lambda modes: modes.real < 0)[0]
@@ -178,11 +179,6 @@ def _solve(matrix: Tensor, right: Tensor) -> Tensor:
     return found
 
 
-def _inverse(matrix: Tensor) -> Tensor:
-    found: Tensor = torch.linalg.inv_ex(matrix)[0]
-    return found
-
-
 class RiccatiStep(NamedTuple):
     """The control u = k + K x that a step chose, and the model g'x + x'Hx/2 of the value before it."""
 
@@ -274,8 +270,8 @@ def doubling_start(a: Tensor, g: Tensor, q: Tensor) -> Doubling:
     # Twice a bound of the eigenvalues of A, so that A - c I has an inverse, and of those of the closed loop.
     speed = a.square().sum((-2, -1)) + (g.square().sum((-2, -1)) * q.square().sum()).sqrt()
     c = 2 * speed.sqrt()[..., None, None]
-    shifted = torch.linalg.inv_ex(a - c * identity)[0]
-    whole = torch.linalg.inv_ex(a - c * identity + product(product(g, shifted.mT), q))[0]
+    shifted = inv_ex(a - c * identity)[0]
+    whole = inv_ex(a - c * identity + product(product(g, shifted.mT), q))[0]
     return Doubling(
         identity + 2 * c * whole,
         2 * c * product(product(shifted, g), whole.mT),
@@ -286,7 +282,7 @@ def doubling_start(a: Tensor, g: Tensor, q: Tensor) -> Doubling:
 def doubling_step(now: Doubling) -> Doubling:
     """The pair of twice as many steps."""
     identity = torch.eye(now.a.shape[-1], dtype=now.a.dtype, device=now.a.device)
-    whole = torch.linalg.inv_ex(identity + product(now.g, now.h))[0]
+    whole = inv_ex(identity + product(now.g, now.h))[0]
     forward = product(now.a, whole)
     g = now.g + product(product(forward, now.g), now.a.mT)
     h = now.h + product(product(now.a.mT, now.h), product(whole, now.a))

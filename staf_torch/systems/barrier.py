@@ -15,7 +15,6 @@ from ..numerics.checks import fail, fails, hold, numbers_of, states
 from .base import ControlAffineSystem, Linearisation, Units
 
 Wall = float | Sequence[float | None] | Tensor | None
-_NAMED = 20  # rows that an error lists
 
 
 class Barrier(ControlAffineSystem):
@@ -102,18 +101,16 @@ class Barrier(ControlAffineSystem):
         """s from x: (..., n) -> (..., n).
 
         Raises:
-            ValueError: if a state is not strictly inside the box; the message names its row.
+            ValueError: if a state is not strictly inside the box; the message names the first such row.
         """
         low, high, center = self.low.to(x), self.high.to(x), self.center.to(x)
         x = center + wrap(x - center, self._turning) if self._turning else x
         inside = ((x > low) & (x < high)).all(-1)
         if fails(inside):
-            rows = (~inside).flatten().nonzero().flatten().tolist()
-            named = ", ".join(map(str, rows[:_NAMED])) + (" and more" if len(rows) > _NAMED else "")
-            first = x.reshape(-1, x.shape[-1])[rows[0]].tolist()
+            row = int((~inside).flatten().nonzero()[0])
             raise ValueError(
                 f"`Barrier.transform(x=...)` must lie strictly between the walls {low.tolist()} and "
-                f"{high.tolist()}; not so row {named}, of which the first is {first}."
+                f"{high.tolist()}; not so row {row}, {x.reshape(-1, x.shape[-1])[row].tolist()}."
             )
         return self.coordinates(x)
 
@@ -148,11 +145,8 @@ class Barrier(ControlAffineSystem):
 
     def stretch(self, s: Tensor) -> Tensor:
         """ds/dx of every coordinate: (..., n) -> (..., n)."""
-        below, above = self.below.to(s), self.above.to(s)
-        left = s < 0
-        small = torch.where(left, s, -s).exp()
-        whole = torch.where(left, below + above * small, above + below * small)
-        return torch.where(self.free.to(s.device), 1.0, whole.square() / ((below + above) * small))
+        _, down, up = self._shares(s)
+        return torch.where(self.free.to(s.device), 1.0, self.below.to(s) / down + self.above.to(s) / up)
 
     def drift(self, s: Tensor) -> Tensor:
         return self.stretch(states(self, "s", s, self.dim)) * self.plant.drift(self.inverse(s))

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..lanes.row_numbers import RowNumbers
-from ..numerics.checks import fail, hold, number, numbers_of, states, vector
+from ..numerics.checks import fail, hold, number, states, vector
 from ..numerics.linalg import exponential, riccati
 from .base import ControlAffineSystem
 
@@ -65,25 +65,18 @@ class Linear(ControlAffineSystem):
         return ((x @ p) * x).sum(-1)
 
 
-def _rows(name: str, matrix: object, rule: str) -> Sequence[Sequence[float]]:
-    rows = numbers_of("Linear", name, matrix)
-    if isinstance(rows, str) or not isinstance(rows, Sequence) or not rows:
-        raise fail("Linear", name, rule, matrix)
-    if not all(isinstance(row, Sequence) and not isinstance(row, str) for row in rows):
-        raise fail("Linear", name, rule, matrix)
-    return rows
-
-
 def _stack(name: str, matrix: object, rule: str) -> Tensor:
-    if isinstance(matrix, RowNumbers) or (isinstance(matrix, Tensor) and matrix.is_meta):
+    if isinstance(matrix, Tensor):
         if matrix.dim() != 2 or (name == "matrix" and len(matrix) != matrix.shape[1]):
             raise fail("Linear", name, rule, tuple(matrix.shape))
-        number("Linear", name, matrix)
-        return matrix.double()
-    learned = matrix if isinstance(matrix, Tensor) and matrix.requires_grad else None
-    rows = _rows(name, matrix if learned is None else learned.detach(), rule)
-    length = len(rows) if name == "matrix" else len(rows[0])
-    numbers = [vector("Linear", name, row, length) for row in rows]
-    if learned is not None:  # a parameter as it is, to be learned
-        return learned if learned.dtype == torch.float64 else learned.double()
+        if isinstance(matrix, RowNumbers) or matrix.is_meta or matrix.requires_grad:
+            number("Linear", name, matrix)
+            return matrix.double()  # a parameter as it is, to be learned
+        matrix = matrix.tolist()
+    if isinstance(matrix, str) or not isinstance(matrix, Sequence) or not matrix:
+        raise fail("Linear", name, rule, matrix)
+    if not all(isinstance(row, Sequence) and not isinstance(row, str) for row in matrix):
+        raise fail("Linear", name, rule, matrix)
+    length = len(matrix) if name == "matrix" else len(matrix[0])
+    numbers = [vector("Linear", name, row, length) for row in matrix]
     return torch.tensor(numbers, dtype=torch.float64, device="cpu")
