@@ -198,14 +198,7 @@ def chunk_length(batch: int, basis: StaFBasis, itemsize: int) -> int:
 
 
 class _ChaseRun:
-    """The rows of a chase on their way through time.
-
-    Args:
-        problem: what is chased.
-        states: the first chunk, (B, C, n).
-        weights: the paper's w before the first correction.
-        everything: whether all results are wanted, or the weights alone.
-    """
+    """The rows of a chase on their way through time."""
 
     @beside
     def __init__(self, problem: Problem, states: Tensor, weights: Tensor | None, *, everything: bool) -> None:

@@ -22,20 +22,11 @@ _TOGETHER = 10  # centers at which V is written out one by one
 class Problem:
     """A gradient chase but for its states, which come in chunks of time.
 
-    Args:
-        call: the public function that was called, for messages.
-        basis: kernel and centers.
-        target: V, (..., n) -> (...).
-        law: the update law.
-        inner_steps: iterations at every time, at least 0.
-        predictor: how the weights move between times; None keeps them.
-        certificate: whether a `Certificate` is wanted.
-
     Raises:
         ValueError: if the law, the iterations or the predictor break their rule.
     """
 
-    call: str
+    call: str  # the public function, for messages
     basis: StaFBasis
     target: Target
     law: UpdateLaw
@@ -97,11 +88,6 @@ class Problem:
     def check_step(self, weights: Tensor, state: LawState, before: LawState) -> None:
         """Refuse what the law made of weights (B, M) if it is not shaped like what it was given.
 
-        Args:
-            weights: the new ones, and their shape is that of the centers.
-            state: the new one.
-            before: what the law was given.
-
         Raises:
             ValueError: naming the law and the part.
         """
@@ -119,10 +105,6 @@ class Problem:
 
     def first_weights(self, states: Tensor, weights: Tensor | None) -> Tensor:
         """Return e^g w before the first correction, (B, M), in units of the first state.
-
-        Args:
-            states: the first chunk, (B, C, n).
-            weights: the paper's w, (M,) or (B, M); None for zero.
 
         Raises:
             ValueError: if the weights have another shape.

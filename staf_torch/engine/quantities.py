@@ -48,13 +48,7 @@ class Local(NamedTuple):
 
 
 def know(problem: Problem, x: Tensor, *, local: bool) -> Known:
-    """Evaluate kernel and target at the states x (..., n).
-
-    Args:
-        problem: basis and target.
-        x: states.
-        local: whether the local space is wanted.
-    """
+    """Evaluate kernel and target at the states x (..., n)."""
     basis = problem.basis
     structure, values = basis.gram_structure(x), problem.values(x)
     if not local:
@@ -68,13 +62,7 @@ def know(problem: Problem, x: Tensor, *, local: bool) -> Known:
 
 
 def precompute(problem: Problem, known: Known, gram: Tensor) -> Precomputed:
-    """Return the fields of `Precomputed` that the law names in its `needs`, the others None.
-
-    Args:
-        problem: the law.
-        known: with the local space, where there are needs.
-        gram: e^{-g} K, (..., M, M).
-    """
+    """Return the fields of `Precomputed` that the law names in its `needs`, the others None."""
     needs, local = problem.law.needs, known.local
     if not needs:
         return Precomputed()
@@ -126,15 +114,8 @@ def numbers(
     lost: Tensor,
     product: Callable[[Tensor], Tensor] | None = None,
 ) -> Numbers:
-    """Return everything that follows from the weights.
-
-    Args:
-        known: at the states x (..., n), with the local space.
-        run: weights before and after the correction.
-        unit: e^{-g} in whose units the weights stand, (...): a row that diverged keeps its last.
-        lost: whether the row has diverged, (...) bool.
-        product: e^{-g} K v, where somebody has it; else the Gram matrix stays in its factors.
-    """
+    """Return everything that follows from the weights, which stand in units of e^{-g}, ``unit`` (...): a row
+    that diverged, ``lost``, keeps its last. ``product`` is e^{-g} K v, where somebody has it."""
     structure, local = known.structure, known.local
     assert local is not None
     space, fitted, ideal, row, value = local

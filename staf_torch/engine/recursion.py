@@ -103,13 +103,7 @@ def start(problem: Problem, states: Tensor, weights: Tensor | None) -> Carry:
 
 
 def recursion(problem: Problem, inputs: Inputs, carry: Carry) -> Recursion:
-    """Correct the weights at every time of a chunk, one after the other.
-
-    Args:
-        problem: law, iterations and predictor.
-        inputs: of the times of this chunk.
-        carry: from the chunk before.
-    """
+    """Correct the weights at every time of a chunk, one after the other."""
     before, after = [], []
     for k in range(inputs.values.shape[1]):
         held, carry = correct(problem, inputs.objective(k), inputs.at(k), carry)
@@ -119,14 +113,7 @@ def recursion(problem: Problem, inputs: Inputs, carry: Carry) -> Recursion:
 
 
 def correct(problem: Problem, objective: Objective, at: Moment, carry: Carry) -> tuple[Tensor, Carry]:
-    """Return the weights as brought to one time, (B, M), and the carry after their correction there.
-
-    Args:
-        problem: law, iterations and predictor.
-        objective: F at that time.
-        at: what else is known of that time.
-        carry: from the time before.
-    """
+    """Return the weights as brought to one time, (B, M), and the carry after their correction there."""
     law, weights, previous, time = problem.law, carry.weights, carry.previous, carry.time
     unit = (at.log_gain - carry.log_gain).exp().unsqueeze(-1)
     brought, state = weights * unit, law.rescale(carry.law_state, unit)
@@ -184,12 +171,7 @@ def last_weights(carry: Carry) -> Tensor:
 
 
 def kept_gain(log_gain: Tensor, carry: Carry) -> Tensor:
-    """Return g in whose units the weights of the last times stand, (B, C): of a row that diverged, its last.
-
-    Args:
-        log_gain: of these times, (B, C).
-        carry: after them.
-    """
+    """Return g in whose units the weights of the last times stand, (B, C): of a lost row, its last."""
     return torch.where(lost(carry, log_gain.shape[1]), carry.log_gain.unsqueeze(-1), log_gain)
 
 

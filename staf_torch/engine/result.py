@@ -149,15 +149,7 @@ def concatenate(pieces: Iterable[ChaseResult]) -> ChaseResult:
 def certify(
     problem: Problem, gram: Tensor, run: Corrected, ideal: Tensor, last: Link
 ) -> tuple[Certificate, Link]:
-    """Return the certificate of some times, and what the times after them need to know.
-
-    Args:
-        problem: law and iterations.
-        gram: e^{-g} K, (..., M, M).
-        run: V(c), g and the weights before and after the correction, (..., M), in units of e^{-g}.
-        ideal: ideal weights, (..., M), in units of e^{-g}.
-        last: of the time before each, (..., M); `first_link` at the start.
-    """
+    """Return the certificate of some times, and what the times after them need to know."""
     objective = NativeError(gram, run.values)
     error = run.after - ideal
     change = run.log_gain - last.log_gain

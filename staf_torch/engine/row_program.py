@@ -53,13 +53,7 @@ class Outputs(NamedTuple):
 
 
 class Step:
-    """The step of a chase: (carry, x_k) to the carry and `Outputs`.
-
-    Args:
-        problem: what is chased.
-        everything: whether all results are wanted, or the weights alone.
-        warns: whether the largest |x| nu(x) is found, of which a caller may warn.
-    """
+    """The step of a chase: (carry, x_k) to the carry and `Outputs`."""
 
     def __init__(self, problem: Problem, everything: bool, warns: bool = True) -> None:
         self.problem, self.everything, self.warns = problem, everything, warns
@@ -121,12 +115,7 @@ class Step:
 
 
 def first_carry(problem: Problem, carry: Carry) -> RowCarry:
-    """Return what a program starts from.
-
-    Args:
-        problem: what is chased.
-        carry: of `recursion.start`.
-    """
+    """Return what a program starts from."""
     weights = carry.weights
     zero, count = torch.zeros_like(carry.log_gain), weights.shape[-1]
     link = None
@@ -149,12 +138,6 @@ def program(problem: Problem, states: Tensor, carry: RowCarry, *, everything: bo
     """Return the program of a chase, None where the definition serves.
 
     One that differs from another in numbers alone takes over its text: `lanes.shared_programs`.
-
-    Args:
-        problem: what is chased.
-        states: the first chunk, (B, C, n).
-        carry: what it starts from.
-        everything: whether all results are wanted, or the weights alone.
     """
     formal = states.is_meta  # of which a program needs one time alone
     if not formal and not worth(states.shape[1] >= SHORTEST, states):
@@ -215,15 +198,7 @@ _REMEMBERED = 64  # chases
 
 
 class Repeated:
-    """A chase from zero weights.
-
-    Args:
-        program: of it.
-        problem: what is chased.
-        states: an example, (B, T, n).
-        everything: whether all results are wanted, or the weights alone.
-        history: whether those of every time are, or the last.
-    """
+    """A chase from zero weights."""
 
     def __init__(
         self, program: Program, problem: Problem, states: Tensor, *, everything: bool, history: bool
@@ -307,12 +282,7 @@ def remember(
     everything: bool,
     history: bool,
 ) -> None:
-    """Prepare for a chase that is made for the second time, where its program needs no more than its states.
-
-    Args:
-        key: of `key_of`.
-        program, problem, states, everything, history: as in `Repeated`.
-    """
+    """Prepare for a chase made for the second time, where its program needs no more than its states."""
     if key is None or program is None or is_users(type(problem.law)) or program.has_rows():
         return
     if _once.pop(key, None) is None:  # to prepare takes as long as a short chase
@@ -326,13 +296,7 @@ def remember(
 
 
 def key_of(states: Any, parts: tuple[Any, ...], *settings: Any) -> Hashable:
-    """Return by which a chase is known again; None of one that begins elsewhere, or that is refused.
-
-    Args:
-        states: one tensor, or what is refused.
-        parts: basis, target, law, predictor.
-        settings: iterations, and what else decides.
-    """
+    """Return by which a chase is known again; None of one that begins elsewhere, or that is refused."""
     if type(states) is not Tensor or type(settings[0]) is not int:
         return None
     try:

@@ -162,10 +162,7 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         if targets.shape[1] != (self.n_outputs_ or 1):
             raise self._refusal("partial_fit", states, values)
         times = None if lapse is None else lapse.to(rows.device).expand(streams.count).contiguous()
-        if not torch._C._len_torch_function_stack():
-            streams.learn(rows, targets, times)
-            return
-        with self._device_:  # whatever the default device is
+        with on(self._device_):
             streams.learn(rows, targets, times)
 
     @opaque
@@ -215,11 +212,8 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         streams, whole = self._streams_, points if several else points.unsqueeze(-2)
         real = points.dtype if points.dtype in _DTYPES.values() else streams.dtype  # the caller's
         rows = self._placed("predict", "x", whole).reshape(streams.count, whole.shape[-2], whole.shape[-1])
-        if not torch._C._len_torch_function_stack():
+        with on(self._device_):
             found = [streams.predict(row.contiguous()) for row in rows.unbind(1)]
-        else:
-            with self._device_:  # whatever the default device is
-                found = [streams.predict(row.contiguous()) for row in rows.unbind(1)]
         shape = (*points.shape[:-1], *(() if self.n_outputs_ is None else (self.n_outputs_,)))
 
         def joined(which: int) -> Any:
@@ -258,14 +252,12 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
         outputs = () if self.n_outputs_ is None else (self.n_outputs_,)
         given = f"{tuple(x.shape)}" + ("" if y is None else f" and y's {tuple(y.shape)}")
         name = type(self).__name__
-        width = (
-            f": X has {x.shape[-1]} features, but {name} is expecting {self.n_features_in_} features as input"
-        )
-        other = width if x.shape[-1:] != self._shape_[-1:] else ""
+        if x.shape[-1:] != self._shape_[-1:]:  # in scikit-learn's words
+            given += f": X has {x.shape[-1]} features, but {name} is expecting {self.n_features_in_} "
+            given += "features as input"
         return ValueError(
             f"`{name}.{call}(x=...)` must have the shape {self._shape_} of the first sample, with "
-            f"{self.n_features_in_} features, and y {(*self._shape_[:-1], *outputs)}; "
-            f"got the shape {given}{other}."
+            f"{self.n_features_in_} features, and y {(*self._shape_[:-1], *outputs)}; got the shape {given}."
         )
 
     def reset(self, streams: Any = None) -> Self:

@@ -83,22 +83,14 @@ class ExperienceMemory(nn.Module):
         self.spacing = positive_real("ExperienceMemory", "spacing", spacing)
         self.visits = integer("ExperienceMemory", "visits", visits, least=1)
         self._lock = ReadWriteLock()
-        like = basis.centers.directions
-        self.states = hold(self, "states", like.new_zeros(*batch_shape, capacity, basis.dim))
-        self.coefficients = hold(self, "coefficients", like.new_zeros(*batch_shape, capacity, basis.count))
-        self.stored = hold(
-            self, "stored", torch.zeros(*batch_shape, capacity, dtype=torch.bool, device=like.device)
-        )
-        self.latest = hold(
-            self, "latest", torch.full(batch_shape, -1, dtype=torch.int64, device=like.device)
-        )  # written last
-        self.origin = hold(
-            self, "origin", like.new_zeros(*batch_shape, basis.dim)
-        )  # where it was first stored
-        self.averaged = hold(
-            self, "averaged", torch.zeros(*batch_shape, capacity, dtype=torch.int64, device=like.device)
-        )
-        self.scatter = hold(self, "scatter", like.new_zeros(*batch_shape, capacity))  # usual distance
+        like, batch = basis.centers.directions, (*batch_shape,)
+        self.states = hold(self, "states", like.new_zeros(*batch, capacity, basis.dim))
+        self.coefficients = hold(self, "coefficients", like.new_zeros(*batch, capacity, basis.count))
+        self.stored = hold(self, "stored", like.new_zeros(*batch, capacity, dtype=torch.bool))
+        self.latest = hold(self, "latest", like.new_full(batch, -1, dtype=torch.int64))  # written last
+        self.origin = hold(self, "origin", like.new_zeros(*batch, basis.dim))  # where it was first stored
+        self.averaged = hold(self, "averaged", like.new_zeros(*batch, capacity, dtype=torch.int64))
+        self.scatter = hold(self, "scatter", like.new_zeros(*batch, capacity))  # usual distance
 
     @property
     def count(self) -> Tensor:

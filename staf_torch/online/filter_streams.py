@@ -52,18 +52,12 @@ class Streams(Protocol):
 
 
 class FilterStreams(Streams):
-    """S streams that a `LocalFilter` filters, in their own units where these are learned.
+    """S streams that a `LocalFilter` filters, with ``scaling`` in units learned from their first samples.
 
-    Args:
-        definition: the filter; its ratio and forgetting have an entry a stream, or one for all.
-        state: of the streams.
-        scaling: whether the units of x and y are learned from the first samples of each stream.
-        units: centers and spreads (S, 2 (n + K)) that are known instead, NaN where they are not.
-        stretch: by which learned spreads are multiplied, (S, n + K), ones by default.
-        may_grow: 1 for coordinates whose units grow with what they are seen to move by, (S, n); by default
-            all where units are learned, none where they are known.
-        periodic: coordinates of x, angles in rad, that are turned by whole turns to within pi of the latest.
-            The centers follow the latest x: what was learned a turn before was forgotten when they left it.
+    ``units``, centers and spreads (S, 2 (n + K)), are known instead, NaN where they are not; learned spreads
+    are multiplied by ``stretch`` (S, n + K). Units of coordinates with 1 in ``may_grow`` (S, n) grow with
+    what they move by: by default all that are learned. ``periodic`` coordinates, angles in rad, are turned
+    by whole turns to within pi of the latest x: centers follow it, and forget what was a turn before.
     """
 
     moves = False
@@ -226,13 +220,7 @@ class FilterStreams(Streams):
         self.first[rows, place[rows], :-1] = self._with_held(both[rows], rows)
         self.turn = torch.where(usable & ~young, (self.turn + 1) % kept, self.turn)
         self.clock += usable & young
-        return (
-            usable
-            & young
-            & torch.isin(
-                self.clock, torch.tensor(LEARNED_AT, dtype=self.clock.dtype, device=self.clock.device)
-            )
-        )
+        return usable & young & torch.isin(self.clock, self.clock.new_tensor(LEARNED_AT))
 
     def _with_held(self, both: Tensor, rows: Tensor) -> Tensor:
         """Put what a stream holds in place of coordinates that no kept sample has: (R, n + K) of these rows.
@@ -272,9 +260,8 @@ class FilterStreams(Streams):
             return
         rows = rows[some]
         self.units[rows, wide : wide + n] = torch.where(grown, moves, unit)[some]
-        order = (self.turn[rows, None] + torch.arange(LEARNED_AT[-1], device=self.turn.device)) % LEARNED_AT[
-            -1
-        ]
+        places = torch.arange(LEARNED_AT[-1], device=self.turn.device)
+        order = (self.turn[rows, None] + places) % LEARNED_AT[-1]
         self._relearn(rows, self.first[rows[:, None], order])
 
     def _leave(self, x: Tensor, both: Tensor) -> None:
@@ -391,12 +378,7 @@ class FilterStreams(Streams):
         for name, own in self._fixed().items():
             given = state.get(name)
             like = isinstance(given, Tensor) and given.shape == own.shape and given.dtype == own.dtype
-            if not (
-                like
-                and torch.allclose(
-                    torch.as_tensor(given, device=getattr(given, "device", "cpu")), own, rtol=1e-9
-                )
-            ):
+            if given is None or not like or not torch.allclose(given, own, rtol=1e-9):
                 told = "must have the kernel, radius and centers of this regressor"
                 raise ValueError(f"`load_state_dict(state=...)` {told}; {name!r} differs.")
         kept = self.state.with_table(state["table"], state["counts"].clone())
@@ -414,25 +396,25 @@ def table_of(state: dict[str, Any]) -> Tensor:
     """The table of a saved state, of two dimensions; raises where it has none."""
     table = state.get("table")
     if not isinstance(table, Tensor) or table.dim() != 2:
-        rule = "must have a tensor 'table' of two dimensions"
-        raise ValueError(f"`load_state_dict(state=...)` {rule}.")
+        raise ValueError("`load_state_dict(state=...)` must have a tensor 'table' of two dimensions.")
     return table
 
 
 def refuse_other(state: dict[str, Any], own: dict[str, Tensor], expected: int, given: int) -> None:
     """Refuse a saved state with other tensors than a new one's ``own``, by name, or other numbers a
     stream."""
-    name = "`load_state_dict(state=...)`"
+    name = "`load_state_dict(state=...)` must have"
     if given != expected:
-        told = f"must have {expected} numbers a stream, as this version and these arguments have; got {given}"
+        told = f"{expected} numbers a stream, as this version and these arguments have; got {given}"
         raise ValueError(f"{name} {told}.")
     for key, tensor in own.items():
         found = state.get(key)
-        if not isinstance(found, Tensor):
-            raise ValueError(f"{name} must have a tensor {key!r}; got {found!r}.")
-        if (found.shape, found.dtype, found.device) != (tensor.shape, tensor.dtype, tensor.device):
-            told = f"must have {key!r} of shape {tuple(tensor.shape)}, {tensor.dtype} on {tensor.device}"
-            raise ValueError(f"{name} {told}; got {tuple(found.shape)}, {found.dtype} on {found.device}.")
+        like = tuple(tensor.shape), tensor.dtype, tensor.device
+        its = (tuple(found.shape), found.dtype, found.device) if isinstance(found, Tensor) else found
+        if its != like:
+            raise ValueError(
+                f"{name} a tensor {key!r} of shape {like[0]}, {like[1]} on {like[2]}; got {its!r}."
+            )
 
 
 def total(values: Tensor) -> Tensor:

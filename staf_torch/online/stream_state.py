@@ -95,21 +95,6 @@ class StreamState:
         lower = parts._replace(learned=parts.learned[row, column])
         return torch.cat([part.reshape(-1, part.shape[-1]) for part in lower])
 
-    @property
-    def anchor(self) -> Tensor:
-        """The state that the centers surround, (n, S)."""
-        return self.parts(self.table).anchor
-
-    @property
-    def mean(self) -> Tensor:
-        """u, (K, M, S)."""
-        return self.parts(self.table).mean[:-1]
-
-    @property
-    def learned(self) -> Tensor:
-        """D, (M, M, S)."""
-        return self.parts(self.table).learned
-
 
 class StateParts(NamedTuple):
     """The rows of a `StreamState`."""

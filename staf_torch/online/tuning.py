@@ -72,34 +72,31 @@ class Tuning(NamedTuple):
     def __repr__(self) -> str:
         """Show the median of the streams, and the least and the largest."""
         (streams, n, outputs), root = self.sizes, math.sqrt(self.width.shape[1])
-        head = f"Tuning of {streams} stream(s), n = {n}, {outputs} output(s), Gaussian kernel"
-        if streams > 1:
-            head += "; medians (least to largest)"
         widths = f"{WIDTHS[0] * root:.3g} to {WIDTHS[-1] * root:.3g} std of x"
+        noise, noises = self.ratio.sqrt(), f"{_ends(NOISES)} std of y"
+        gain = f"{_spread_of(self.untuned)} untuned (`scaling=True`)"
         rows = [("", "chosen", "in standard deviations", "tried first; then around the best")]
         for k in range(min(n, _SHOWN)):
-            shown = _spread_of(self.spread[:, k]), f"{_spread_of(self.width[:, k])} std of x[{k}]"
+            own = _spread_of(self.spread[:, k]), f"{_spread_of(self.width[:, k])} std of x[{k}]"
             unknown = int(self.unknown[:, k].sum())
             rows.append(
-                (f"width of x[{k}]", *shown, widths + (f"; {unknown} not told by x" if unknown else ""))
+                (f"width of x[{k}]", *own, widths + (f"; {unknown} not told by x" if unknown else ""))
             )
         if n > _SHOWN:
             rows.append((f"{n - _SHOWN} more widths", "in `.spread`", "in `.width`", widths))
-        noise = self.ratio.sqrt()
         for k in range(outputs):
-            shown = _spread_of(noise * self.spread[:, n + k]), f"{_spread_of(noise)} std of y"
-            rows.append(
-                (f"noise of y[{k}]" if outputs > 1 else "noise of y", *shown, f"{_ends(NOISES)} std of y")
-            )
-        rows.append(("forgetting", _spread_of(self.forgetting), "a unit of time", _ends(FORGETTING)))
-        rows.append(
-            ("radius of centers", _spread_of(self.radius[:1]), "widths, for all streams", _ends(RADII))
-        )
-        gain = f"{_spread_of(self.untuned)} untuned (`scaling=True`)"
-        rows.append(("log density", _spread_of(self.likelihood), "nats a sample, y in std", gain))
-        wide = [max(len(row[k]) for row in rows) for k in range(3)]
-        lines = ["  ".join((*(f"{a:{w}}" for a, w in zip(row, wide, strict=False)), row[3])) for row in rows]
-        return "\n".join((head, *(line.rstrip() for line in lines)))
+            own = _spread_of(noise * self.spread[:, n + k]), f"{_spread_of(noise)} std of y"
+            rows.append((f"noise of y[{k}]" if outputs > 1 else "noise of y", *own, noises))
+        rows += [
+            ("forgetting", _spread_of(self.forgetting), "a unit of time", _ends(FORGETTING)),
+            ("radius of centers", _spread_of(self.radius[:1]), "widths, for all streams", _ends(RADII)),
+            ("log density", _spread_of(self.likelihood), "nats a sample, y in std", gain),
+        ]
+        a, b, c, _ = (max(map(len, column)) for column in zip(*rows, strict=True))
+        head = f"Tuning of {streams} stream(s), n = {n}, {outputs} output(s), Gaussian kernel"
+        head += "; medians (least to largest)" if streams > 1 else ""
+        lines = (f"{name:{a}}  {own:{b}}  {std:{c}}  {tried}".rstrip() for name, own, std, tried in rows)
+        return "\n".join((head, *lines))
 
     def keep(self, rows: Tensor) -> Tuning:
         """Keep the streams with these numbers alone; the radius stays the one that serves all."""
@@ -154,11 +151,10 @@ def tuning(x: Tensor, y: Tensor, directions: Tensor, method: str = "search") -> 
     first = first._replace(width=first.width.unsqueeze(-1).expand(-1, -1, n))
     found: list[tuple[Tensor, _Candidates, Tensor]] = []
     for radius in RADII:
-        scores: Scores = _StretchScores(samples, n, radius * directions)
-        if method == "search":
-            scores = functools.partial(_scores, samples=samples, n=n, offsets=radius * directions)
+        scored, improved = (_scores, _searched) if method == "search" else (_stretch_scores, _ascended)
+        scores: Scores = functools.partial(scored, samples=samples, n=n, offsets=radius * directions)
         grid = scores(first)
-        best, score = (_searched if method == "search" else _ascended)(first, grid, scores)
+        best, score = improved(first, grid, scores)
         found.append((score, best, _unknown(best, score, scores)))
     which = torch.stack([score for score, *_ in found]).argmax(0)
     one = which == 1
@@ -242,28 +238,20 @@ def _scores(candidates: _Candidates, samples: Tensor, n: int, offsets: Tensor) -
     return score
 
 
-class _StretchScores:
-    """`_scores` by the program that runs the filter over a stretch of samples (T, S, n + K), with
-    gradients by the candidates; centers of offsets (M, n)."""
-
-    def __init__(self, samples: Tensor, n: int, offsets: Tensor) -> None:
-        self._x, self._y = samples[:, :, None, :n], samples[:, :, None, n:]
-        unit = torch.ones(1, dtype=torch.float64, device="cpu")
-        self._functions = OwnFunctions.of(unit, offsets.unsqueeze(0))
-        self._slack = float(offsets.square().sum(-1).amax().sqrt())
-
-    def __call__(self, candidates: _Candidates) -> Tensor:
-        """Return their likelihoods, (S, C)."""
-        shape, times = candidates.noise.shape, len(self._x)
-        x = (self._x / candidates.width).flatten(1, 2).transpose(0, 1)
-        y = self._y.expand(-1, *shape, -1).flatten(1, 2).transpose(0, 1)
-        functions = OwnFunctions(*(part.expand(*part.shape[:-1], len(x)) for part in self._functions))
-        law = candidates.noise.flatten() ** 2, candidates.forgetting.flatten()
-        found = forecasts(LocalFilter(functions, *law, self._slack), x, y, x.new_ones(len(x), times))
-        later = slice(times // 3 + 1, None)
-        density = _log_density(y[:, later], *(part[:, later] for part in found))
-        likelihood: Tensor = density.sum((1, 2)).unflatten(0, shape)
-        return likelihood
+def _stretch_scores(candidates: _Candidates, samples: Tensor, n: int, offsets: Tensor) -> Tensor:
+    """`_scores` by the program that runs the filter over a stretch, with gradients by the candidates."""
+    shape, times = candidates.noise.shape, len(samples)
+    x = (samples[:, :, None, :n] / candidates.width).flatten(1, 2).transpose(0, 1)
+    y = samples[:, :, None, n:].expand(-1, *shape, -1).flatten(1, 2).transpose(0, 1)
+    alike = OwnFunctions.of(offsets.new_ones(1), offsets.unsqueeze(0))
+    functions = OwnFunctions(*(part.expand(*part.shape[:-1], len(x)) for part in alike))
+    slack = float(offsets.square().sum(-1).amax().sqrt())
+    law = candidates.noise.flatten() ** 2, candidates.forgetting.flatten()
+    found = forecasts(LocalFilter(functions, *law, slack), x, y, x.new_ones(len(x), times))
+    later = slice(times // 3 + 1, None)
+    density = _log_density(y[:, later], *(part[:, later] for part in found))
+    likelihood: Tensor = density.sum((1, 2)).unflatten(0, shape)
+    return likelihood
 
 
 def _log_density(y: Tensor, mean: Tensor, deviation: Tensor) -> Tensor:

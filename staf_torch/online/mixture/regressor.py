@@ -62,31 +62,14 @@ _packed = struct.Struct("8q").pack  # `Call` of _bank.cpp: what belongs to a cal
 class Bank(Streams):
     """Bounded memory, local Gaussian processes on it, and carried models, for many streams.
 
-    A stream keeps C samples: the latest `RECENT` and others spread in space, as a full store gives up the
-    older of the closest pair of those that are not recent. At x a linear model (recursive least squares)
-    predicts, and 24 Gaussian processes on k samples correct what it leaves: the k nearest, without and
-    with two rates of fading by age, and the k latest, each with three widths and two noises, amplitudes
-    y'K^-1 y / k. Beside them stand eight filters (`LocalFilter`, M = n + 1), eight models quadratic in x
-    (recursive least squares, five rates of forgetting), eight Gaussian processes on at most 95 samples of the
-    whole past that fade (`TrackerModels`; four learn width, noise, rate of fading and a metric), that linear
-    model and the last value.
+    A stream keeps C samples: the latest `RECENT` and others spread in space. At x a linear model (recursive
+    least squares) predicts, and 24 Gaussian processes on k samples correct what it leaves: the k nearest,
+    without and with two rates of fading by age, and the k latest, each with three widths and two noises,
+    amplitudes y'K^-1 y / k. Beside them stand filters (`LocalFilter`, M = n + 1), `QuadraticModels`,
+    `TrackerModels`, that linear model and the last value. `mix` and `judge` say how they are mixed.
 
-    Every member's variance is scaled by its running squared error. The members are mixed by discounted
-    scores, part Student-t likelihood with the member's variance, part with the common running error, at
-    three rates of discount, and the less the less certain they are; the three mixtures are mixed alike. With
-    what least squares on groups of members adds to that, and a mixture by squared errors over a long time,
-    they make a mean, and a map of that mean to what usually follows it (33 knots) makes another one, for
-    functions that saturate and targets of few values; the four are weighed by how they predict. The variance
-    follows the running squared error.
-
-    Args:
-        shape: sizes.
-        streams: S.
-        scaling: whether the units of x and y are learned, from the first 2, 5, 10, 20 and 40 samples.
-        doubtful: standard deviations beyond which a sample waits for the next one: if that is as far off,
-            both are learned, else the first is skipped. By default 30, and 8 for an error of more than 12
-            spreads of y. Where more than one in twenty is doubted, none waits.
-        compile: whether compiled code runs where there is a compiler; else the definition.
+    An error of more than ``doubtful`` deviations, by default `Rules`', lets a sample wait for the next one.
+    With ``compile`` compiled code runs where there is a compiler; else the definition.
     """
 
     moves = True

@@ -237,14 +237,6 @@ def mix(r: Rules, s: dict[str, Tensor], low: Tensor, high: Tensor, level: Tensor
     three are weighed by how they predict, and one far behind the best has no weight. Fourth, what usually
     follows where these three say what they say, which is another value where a function saturates or a target
     has few values; it is weighed alike.
-
-    Args:
-        r: the constants.
-        s: parts of a stream; ``means`` and ``variances`` are what the members say.
-        low: of the range in which a prediction must be, (K,).
-        high: (K,).
-        level: mean of y, (K,).
-        wide: its spread, (K,).
     """
     means = s["means"]
     claims = s["variances"].clamp(min=_LEAST).log()
