@@ -11,8 +11,7 @@ from ..approximation.basis import StaFBasis
 from ..centers import StateFollowingCenters, cross_polytope
 from ..kernels import ExponentialKernel
 from ..lanes.gradients import without_gradient
-from ..lanes.per_row.decisions import at_once, is_of_rows, most_of_rows
-from ..lanes.per_row.each_row import spread_rows, tried
+from ..lanes.per_row.decisions import at_once, is_of_rows, most_of_rows, spread_rows, tried
 from ..lanes.per_row.kinds import Kind, kinds_of_rows
 from ..lanes.per_row.objects import row_of
 from ..lanes.torch_compile.operators import opaque

@@ -18,7 +18,7 @@ from ..deploy import c_header, data_sheet, export_learning_c, formats, trace
 from ..deploy.controllers import made_name
 from ..deploy.data_sheet import Port
 from ..deploy.formats import in_loops
-from ..lanes.emit.identifiers import checked_names
+from ..lanes.emit.c import checked_names
 from ..numerics.checks import choice, fail
 from ..results.build import processor
 from ..results.files import visible, write_text

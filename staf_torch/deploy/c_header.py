@@ -16,8 +16,7 @@ from torch import Tensor, nn
 from ..adp import Controller
 from ..lanes import Program
 from ..lanes.compilation.compiler import run
-from ..lanes.emit.c import commented
-from ..lanes.emit.identifiers import checked_names, guarded
+from ..lanes.emit.c import checked_names, commented, guarded
 from ..lanes.emit.row_c import RowC, wide
 from ..lanes.per_row.objects import refuse_rows, row_of
 from ..lanes.trace.step import Step

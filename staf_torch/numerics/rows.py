@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from ..lanes.per_row.each_row import each_row
+from ..lanes.per_row.decisions import each_row
 from . import show
 from .checks import fail
 

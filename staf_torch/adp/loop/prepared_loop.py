@@ -21,8 +21,7 @@ from ...lanes import Program
 from ...lanes.calls.inputs import served
 from ...lanes.dependencies.contents import Contents
 from ...lanes.gradients import wants_gradient
-from ...lanes.per_row.decisions import decided
-from ...lanes.per_row.each_row import each_row
+from ...lanes.per_row.decisions import decided, each_row
 from ...lanes.row_numbers import anybodys, over_rows
 from ...numerics.checks import fail, positive_real, trailing
 from ...numerics.default_device import without_numbers

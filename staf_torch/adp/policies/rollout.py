@@ -18,7 +18,7 @@ from ...lanes.calls import inputs
 from ...lanes.calls.planned_call import PlannedCall
 from ...lanes.dependencies.contents import Contents
 from ...lanes.gradients import grad
-from ...lanes.per_row.each_row import each_row
+from ...lanes.per_row.decisions import each_row
 from ...lanes.per_row.objects import Rowwise
 from ...lanes.prepared_call import Plan
 from ...lanes.row_numbers import RowNumbers, points_of_rows

@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from ...lanes import repeat
-from ...lanes.per_row.decisions import is_of_rows
-from ...lanes.per_row.each_row import each_row, met_rows
+from ...lanes.per_row.decisions import each_row, is_of_rows, met_rows
 from ...lanes.per_row.objects import made_by_rows
 from ...lanes.row_numbers import nonzero
 from ...lanes.trace.loops import untraced

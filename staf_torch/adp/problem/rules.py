@@ -13,8 +13,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from ...lanes.per_row.decisions import numbers_of_rows, of_first
-from ...lanes.per_row.each_row import each_row
+from ...lanes.per_row.decisions import each_row, numbers_of_rows, of_first
 from ...lanes.row_numbers import RowNumbers, nonzero
 from ...numerics.checks import fail, object_of, positive_real
 from ...numerics.default_device import device_of

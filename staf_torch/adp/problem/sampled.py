@@ -14,8 +14,7 @@ from torch.nn.functional import pad
 
 from ...lanes import each, traced_as
 from ...lanes.gradients import vjp, without_gradient
-from ...lanes.per_row.decisions import in_any_row
-from ...lanes.per_row.each_row import first_row
+from ...lanes.per_row.decisions import first_row, in_any_row
 from ...lanes.per_row.objects import Note, OfRows
 from ...numerics.angles import turned, unwrapped, wrap
 from ...numerics.checks import fail, hold, integer, trailing

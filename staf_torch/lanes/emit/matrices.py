@@ -1,11 +1,147 @@
-"""Statements about whole matrices that stay in memory."""
+"""Statements about whole matrices that stay in memory: sums of products, a tridiagonal form, eliminations.
+
+A sum by itself reads two numbers for a multiplication. Several rows of sums, or of two matrices a square of
+rows and columns, are computed side by side; each still adds its products in its own order, so that the bits
+are those of one.
+
+As single numbers an elimination is a text that grows with the cube of its size; as passes over whole
+matrices (`trace.factorisations`) it writes every entry to memory once a pass. Here loops go through the
+entries, in the order of those passes, which keeps every bit, and what becomes of an entry stays in a
+register until it is done.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
+from typing import Any, ClassVar
 
-from .products import ProductWriter
+import numpy as np
+
+from ..trace.graph import NARROW
+from ..trace.tracer import LARGE
 from .schedule import evenly, leaves
+from .statements import StatementWriter
+
+Index = tuple[list[int], int]
+
+
+class ProductWriter(StatementWriter):
+    """Writes sums of products; those of two matrices in memory by squares of the result."""
+
+    _side: ClassVar[int] = 0  # rows and columns of a square at most; 0 for none
+
+    def _over(self, name: str, begin: str, end: str | int, step: int = 1) -> AbstractContextManager[None]:
+        further = f"++{name}" if step == 1 else f"{name} += {step}"
+        return self._braces(f"for (int {name} = {begin}; {name} < {end}; {further})")
+
+    def _dot(self, node: int) -> None:
+        self._declare(node)
+        outs = self.graph.aux[node][0]
+        columns, indices = self._columns(node) if self._side and outs > LARGE else (0, [])
+        if not columns:
+            return self._panels(node)
+        for rows, across in itertools.product(cuts(outs // columns, self._side), cuts(columns, self._side)):
+            with self._over("u0", str(rows[0]), *rows[1:]), self._over("u1", str(across[0]), *across[1:]):
+                self._square(node, columns, indices, rows[2], across[2])
+
+    def _columns(self, node: int) -> tuple[int, list[Index]]:
+        """The columns of a product of two matrices, and where these are read; 0 where it is none."""
+        outs, count, *places = self.graph.aux[node]
+        for columns in (n for n in range(outs // 2, 1, -1) if outs % n == 0 and None not in places):
+            indices = [evenly(place, [outs // columns, columns, count]) for place in places]
+            found = [index for index in indices if index is not None]
+            if len(found) == 2 and sorted((bool(s[0]), bool(s[1])) for s, _ in found) == [
+                (False, True),
+                (True, False),
+            ]:
+                return columns, found
+        return 0, []
+
+    def _square(self, node: int, columns: int, indices: list[Index], rows: int, across: int) -> None:
+        """Sums of some rows and columns: a pass reads a number of each."""
+        count, operands = self.graph.aux[node][1], self.graph.args[node]
+        kind = self._type(node)
+        rounded = self._narrowed if self.graph.type[node] == NARROW else str
+        by_row = [bool(strides[0]) for strides, _ in indices]
+        sides = [rows if of_row else across for of_row in by_row]
+        entries = [(r, c, j) for r in range(rows) for c in range(across) for j in range(self.copies)]
+
+        def read(q: str) -> None:
+            for k, operand in enumerate(operands):
+                for e, j in itertools.product(range(sides[k]), range(self.copies)):
+                    u = [f"(u{0 if by_row[k] else 1} + {e})", q]
+                    at = self._sum(u, [indices[k][0][0] or indices[k][0][1], indices[k][0][2]], indices[k][1])
+                    self._line(f"const {kind} x{k}_{e}{self._copy(j)} = {self._read(operand, at, j)};")
+
+        def factors(r: int, c: int, j: int) -> tuple[str, str]:
+            first, second = (f"x{k}_{r if by_row[k] else c}{self._copy(j)}" for k in range(2))
+            return first, second
+
+        for r, c, j in entries:
+            self._line(f"{kind} r{r}_{c}{self._copy(j)};")
+        with self._braces(""):
+            read("0")
+            for r, c, j in entries:
+                self._line(f"r{r}_{c}{self._copy(j)} = {rounded(' * '.join(factors(r, c, j)))};")
+        with self._over("u2", "1", count):
+            read("u2")
+            for r, c, j in entries:
+                name = f"r{r}_{c}{self._copy(j)}"
+                self._line(f"{name} = {rounded(self._fma(*factors(r, c, j), name))};")
+        for r, c, j in entries:
+            at = f"((u0 + {r}) * {columns} + u1 + {c}) * {self.copies} + {j}"
+            self._line(f"a{node}[{at}] = r{r}_{c}{self._copy(j)};")
+
+    def _panels(self, node: int) -> None:
+        """Sums of products, some rows of them in registers at once."""
+        outs, count, *places = self.graph.aux[node]
+        kind = self._type(node)
+        rounded = self._narrowed if self.graph.type[node] == NARROW else str
+        indices = [evenly(place, [outs, count]) for place in places]
+        widths = range(4, 1 + (6 if self.copies > 1 else 8))
+        panel = min(outs, min(reversed(widths), key=lambda width: -(-outs // width) * width))
+        full = outs // panel
+        for start, rows, passes in ((0, panel, full), (full * panel, outs % panel, 1)):
+            if rows == 0 or passes == 0:
+                continue
+            with self._braces(f"for (int p = {start}; p < {start + rows * passes}; p += {rows})"):
+                for r in range(rows):
+                    for j in range(self.copies):
+                        first = self._product(node, indices, places, r, "0", j)[2]
+                        self._line(f"{kind} r{r}{self._copy(j)} = {rounded(first)};")
+                with self._braces(f"for (int q = 1; q < {count}; ++q)"):
+                    for r in range(rows):
+                        for j in range(self.copies):
+                            a, b, _ = self._product(node, indices, places, r, "q", j)
+                            name = f"r{r}{self._copy(j)}"
+                            self._line(f"{name} = {rounded(self._fma(a, b, name))};")
+                for r in range(rows):
+                    for j in range(self.copies):
+                        self._line(f"a{node}[(p + {r}) * {self.copies} + {j}] = r{r}{self._copy(j)};")
+
+    def _product(self, node: int, indices: Any, places: Any, r: int, q: str, j: int) -> tuple[str, str, str]:
+        count, values = self.graph.aux[node][1], []
+        for operand, place, index in zip(self.graph.args[node], places, indices, strict=True):
+            if place is None:
+                values.append(self._ref(operand, j))
+            elif index is not None:
+                values.append(self._read(operand, self._sum([f"(p + {r})", q], *index), j))
+            else:
+                values.append(self._read(operand, self._lookup(place, f"(p + {r}) * {count} + {q}"), j))
+        return values[0], values[1], f"{values[0]} * {values[1]}"
+
+
+def cuts(size: int, widest: int) -> Iterator[tuple[int, int, int]]:
+    """Begin, end and width of the pieces of a length: as many alike as there are, and what is left."""
+    width = min(size, min(range(widest, widest // 2, -1), key=lambda width: -(-size // width) * width))
+    whole = size // width * width
+    yield 0, whole, width
+    if whole < size:
+        yield whole, size, size - whole
+
 
 _ARRAYS = {"a": "", "h": "_1", "v": "_2", "w": "_3"}
 """What of the operation is in arrays: its result, the triangle, the vector of a reflection and its image."""
@@ -162,3 +298,132 @@ class MatrixWriter(ProductWriter):
 def _packed(row: str, column: str) -> str:
     """The place of an entry of a lower triangle, row by row."""
     return f"({row}) * (({row}) + 1) / 2 + {column}"
+
+
+_COLUMNS = 5  # of a solution that are in registers at once
+
+
+class EliminationWriter(MatrixWriter):
+    """Writes, besides, Cholesky's factor and the solution under a lower triangle, in an array of the node.
+
+    Each entry is computed as by the passes over whole matrices in `trace.factorisations`, in their order.
+    """
+
+    def _cholesky(self, node: int) -> None:
+        """L, and after it 0 or the place of a pivot that is not positive."""
+        size = self.graph.aux[node][1][0]
+        self._declare(node)
+        self._variables(node, 1, 0.0)  # the place
+        self._variables(node, 2, 1.0)  # of this pass
+        with self._over("i0_0", "0", size):
+            with self._over("i0_1", "i0_0", size):
+                ats = self._entry_of_each(node, [size, size], ("i0_1", "i0_0"))
+                self._sums(node, "sum", lambda j: self._mapped(node, iter(ats), j))
+                with self._over("i0_2", "0", "i0_0"):
+                    for j in range(self.copies):
+                        one, other = (
+                            self._part("a", node, f"{at} * {size} + i0_2", j) for at in ("i0_1", "i0_0")
+                        )
+                        self._line(f"sum{self._copy(j)} = sum{self._copy(j)} - {one} * {other};")
+                for j in range(self.copies):
+                    entry = self._part("a", node, f"i0_1 * {size} + i0_0", j)
+                    self._line(f"{entry} = sum{self._copy(j)};")
+            for j in range(self.copies):
+                failed, done, root = (f"t{node}_{k}{self._copy(j)}" for k in (1, 2, 3))
+                zero, one = (self._stated(value, self.graph.type[node]) for value in (0.0, 1.0))
+                pivot = self._part("a", node, f"i0_0 * {size} + i0_0", j)
+                first = self._op("where", node, self._op("eq", node, failed, zero), done, failed)
+                fine = self._op("lt", node, zero, pivot)
+                self._line(f"{failed} = {self._op('where', node, fine, failed, first)};")
+                self._line(f"{done} = {done} + {one};")
+                self._line(f"const {self._type(node)} {root} = {self._op('sqrt', node, pivot)};")
+            with self._over("i0_1", "i0_0", size):
+                for j in range(self.copies):
+                    entry = self._part("a", node, f"i0_1 * {size} + i0_0", j)
+                    self._line(f"{entry} = {entry} / t{node}_3{self._copy(j)};")
+        with self._over("i0_1", "0", size), self._over("i0_2", "i0_1 + 1", size):
+            for j in range(self.copies):
+                zero = self._stated(0.0, self.graph.type[node])
+                self._line(f"{self._part('a', node, f'i0_1 * {size} + i0_2', j)} = {zero};")
+        for j in range(self.copies):
+            self._line(f"{self._part('a', node, str(size * size), j)} = t{node}_1{self._copy(j)};")
+
+    def _substitute(self, node: int, unit: bool = False) -> None:
+        """T^-1 B beside the place of T, row by row: some columns at a time."""
+        size, row = self.graph.aux[node][1]
+        self._declare(node)
+        with self._over("i0_0", "0", size):
+            for begin, end, width in cuts(row - size, _COLUMNS):
+                with self._over("i0_1", str(begin), end, width):
+                    self._substituted(node, size, row, width, unit)
+
+    def _substituted(self, node: int, size: int, row: int, width: int, unit: bool) -> None:
+        """Entries of row i0_0 of the solution."""
+        read = self._sides(node)
+        for c in range(width):
+            for j in range(self.copies):
+                self._line(f"{self._type(node)} r{c}{self._copy(j)} = {read(1, f'(i0_1 + {c})', j)};")
+        with self._over("i0_2", "0", "i0_0"):
+            self._sums(node, "x", lambda j: read(0, "i0_2", j))
+            for c, j in itertools.product(range(width), range(self.copies)):
+                other = self._part("a", node, f"i0_2 * {row} + i0_1 + {size + c}", j)
+                self._line(f"r{c}{self._copy(j)} = r{c}{self._copy(j)} - x{self._copy(j)} * {other};")
+        if not unit:
+            self._sums(node, "x", lambda j: read(0, "i0_0", j))
+        for c, j in itertools.product(range(width), range(self.copies)):
+            entry = self._part("a", node, f"i0_0 * {row} + i0_1 + {size + c}", j)
+            self._line(f"{entry} = r{c}{self._copy(j)}{'' if unit else f' / x{self._copy(j)}'};")
+
+    def _substitute_unit(self, node: int) -> None:
+        self._substitute(node, unit=True)
+
+    def _sums(self, node: int, name: str, value: Callable[[int], str]) -> None:
+        """Declare a variable that begins with a value."""
+        for j in range(self.copies):
+            self._line(f"{self._type(node)} {name}{self._copy(j)} = {value(j)};")
+
+    def _sides(self, node: int) -> Callable[[int, str, int], str]:
+        """Return what reads an entry of row i0_0 of T (0) or of B (1)."""
+        size, row = self.graph.aux[node][1]
+        apart = self._apart(node)
+        if apart is None:
+
+            def read(side: int, column: str, j: int) -> str:
+                ats = self._entry_of_each(node, [size, row], ("i0_0", f"({column} + {side * size})"))
+                return self._mapped(node, iter(ats), j)
+
+        else:
+
+            def read(side: int, column: str, j: int) -> str:
+                entry, index = apart[side]
+                return self._read_like(entry, self._sum(["i0_0", column], *index), j)
+
+        return read
+
+    def _apart(self, node: int) -> list[tuple[int, tuple[list[int], int]]] | None:
+        """An entry of T and of B and where the others lie, if an array is there for them alone; else None."""
+        graph, (pack,), (_, (size, row), places) = self.graph, self.graph.args[node], self.graph.aux[node]
+        alone = self.schedule.uses[pack] == 1 and self.schedule.together(pack, node)
+        if graph.op[pack] != "pack" or not alone or self._in_place(pack) is not None:
+            return None
+        table, found = np.array(graph.args[pack])[list(places)].reshape(size, row), []
+        for part in (table[:, :size], table[:, size:]):
+            of = [self._place_in_array(int(entry)) for entry in part.flat]
+            index = evenly([place for _, place in of], part.shape)
+            if index is None or len({source for source, _ in of}) > 1:
+                return None
+            found.append((int(part.flat[0]), index))
+        return found
+
+    def _pack(self, node: int) -> None:
+        """Write an array, unless it is there for a substitution alone, which reads what it is made of."""
+        reader = self._readers.get(node)
+        if reader is None or self._apart(reader) is None:
+            super()._pack(node)
+
+    @functools.cached_property
+    def _readers(self) -> dict[int, int]:
+        """The substitutions, by what they read."""
+        graph = self.graph
+        of = [n for n in self.schedule.live if graph.op[n] in ("substitute", "substitute_unit")]
+        return {graph.args[n][0]: n for n in of}

@@ -24,8 +24,8 @@ from ..calls.inputs import Given
 from ..dependencies.contents import Contents, leads_by_copies, told_copies
 from ..dependencies.walk import BOUND, EMPTY, Derived, content_of
 from ..trace.captured_tensors import Recipe, tensors
+from ..trace.decompositions import MOVEMENTS
 from ..trace.graph import WIDE
-from ..trace.indexing import MOVEMENTS
 from ..trace.step import Step, Traced, trace
 from ..trace.tracer import LARGE, NotLoweredError
 from ..tree import labels

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..trace.graph import Graph, Sizes
 from ..trace.tracer import LARGE
-from .eliminations import EliminationWriter
+from .matrices import EliminationWriter
 from .schedule import Schedule, ends_with, taken_over
 
 

@@ -26,8 +26,7 @@ from ..dependencies.contents import Contents
 from ..dependencies.walk import BOUND, Derived
 from ..row_numbers import RowNumbers, all_rows, in_use, over_rows
 from ..tree import Shared, plain
-from .decisions import DecidedByRows, at_once, is_of_rows
-from .each_row import beside, spread_rows, tried
+from .decisions import DecidedByRows, at_once, beside, is_of_rows, spread_rows, tried
 
 Some = TypeVar("Some")
 Given = ParamSpec("Given")

@@ -1,8 +1,8 @@
 """Tracing of a step with a single row: inputs become nodes, each operation is looked up among the rules.
 
-An operation has a rule in single numbers (`entrywise`, `reductions`), moves entries (`indexing`: torch itself
+An operation has a rule in single numbers (`rules`), moves entries (`decompositions`: torch itself
 moves the numbers of nodes), or is written in simpler operations of torch that are traced in its place: this
-library's (`factorisations`, `eigenvalues`, `decompositions`), else torch's own decomposition.
+library's (`factorisations`, `decompositions`), else torch's own decomposition.
 """
 
 from __future__ import annotations
@@ -19,14 +19,12 @@ from torch.overrides import TorchFunctionMode
 from ..calls.inputs import Given, uncast
 from ..row_numbers import RowNumbers, made_of_list, resolving
 from ..tree import Shared, Tree, flatten, plain
-from . import eigenvalues, factorisations
-from . import reductions as reductions  # its rules
+from . import factorisations
 from .captured_tensors import Recipe, tensors
-from .decompositions import REPLACEMENTS, of_torch
-from .entrywise import RULES
+from .decompositions import CHOICES, MOVEMENTS, REPLACEMENTS, added_at, many, moved, of_torch
 from .graph import NOW, STEP, Graph, Sizes
-from .indexing import CHOICES, MOVEMENTS, added_at, many, moved
 from .loops import tracing
+from .rules import RULES
 from .tracer import NotLoweredError, Tracer
 
 RULES["scatter_add"] = added_at
@@ -231,7 +229,7 @@ class _TorchFunctions(TorchFunctionMode):
         kwargs, plain, name = kwargs or {}, _PLAIN.get(func), getattr(func, "__name__", "")
         if plain is not None and args and isinstance(args[0], Tensor):
             wrapped = torch._C._functorch.is_functorch_wrapped_tensor(args[0])
-            if plain is eigenvalues.eigenvalues:  # a bisection has no derivative worth the name
+            if plain is factorisations.eigenvalues:  # a bisection has no derivative worth the name
                 chosen = not wrapped and len(args) == 1 and not kwargs and self._traced(args[0])
             else:
                 chosen = wrapped or self._traced(args[0])
@@ -259,7 +257,7 @@ def _outside_transforms() -> Any:
 
 _LEAVES_TORCH = ("numpy", "__array__", "tolist", "__dlpack__", "__repr__")
 _PLAIN: dict[Any, Callable[..., Any]] = {
-    torch.linalg.eigvalsh: eigenvalues.eigenvalues,
+    torch.linalg.eigvalsh: factorisations.eigenvalues,
     torch.nn.functional.one_hot: _one_hot,
     **dict.fromkeys((torch.isfinite, Tensor.isfinite), _is_finite),
     **dict.fromkeys((torch.linalg.det, torch.det, Tensor.det), factorisations.determinant),
@@ -275,5 +273,5 @@ FACTORISATIONS: dict[str, Callable[..., Any]] = {
     "_linalg_solve_ex": factorisations.solve,
     "linalg_lu_solve": factorisations.solve_again,
     "linalg_qr": factorisations.orthogonal,
-    "_linalg_eigh": eigenvalues.eigen,
+    "_linalg_eigh": factorisations.eigen,
 }
