@@ -9,9 +9,9 @@ import zlib
 from collections.abc import Collection, Sequence
 from typing import ClassVar, NamedTuple
 
-from ..trace.graph import FIXED, FLAG, NARROW, REAL, ROW, STEP, WHOLE, WIDE, Graph, Sizes
-from .matrices import EliminationWriter
-from .schedule import Schedule
+from ..trace.graph import FLAG, NARROW, REAL, ROW, STEP, WHOLE, WIDE, Graph, Sizes
+from .matrices import MatrixWriter
+from .schedule import Schedule, constants
 
 _NAMES = {"abs": "fabs", "round": "rint"}
 
@@ -70,11 +70,11 @@ _PHILOX = """%(how)s %(real)s %(name)s(%(given)s)
 """
 
 
-class ScalarWriter(EliminationWriter):
+class ScalarWriter(MatrixWriter):
     """Writer of scalar code, common to C and CUDA C: every number is a variable of its own."""
 
-    _infix: ClassVar[dict[str, str]] = EliminationWriter._infix | {"and": "&&", "or": "||", "xor": "!="}
-    _prefix: ClassVar[dict[str, str]] = EliminationWriter._prefix | {"not": "!"}
+    _infix: ClassVar[dict[str, str]] = MatrixWriter._infix | {"and": "&&", "or": "||", "xor": "!="}
+    _prefix: ClassVar[dict[str, str]] = MatrixWriter._prefix | {"not": "!"}
 
     def __init__(self, graph: Graph, schedule: Schedule, layout: Sizes, names: Names) -> None:
         self.real, self._suffix = ("float", "f") if graph.single else ("double", "")
@@ -166,9 +166,7 @@ class _CWriter(ScalarWriter):
     def _lay_out(self) -> None:
         """Find a place for every parameter: those of an array side by side, as far as they can be."""
         graph, live = self.graph, sorted(self.schedule.live)
-        fixed = [
-            n for n in live if graph.op[n] == "pack" and all(graph.op[a] in FIXED for a in graph.args[n])
-        ]
+        fixed = [node for node in live if constants(graph, node)]
         for pack in fixed:
             numbers = [graph.aux[node] for node in graph.args[pack] if graph.op[node] == "param"]
             free = len({*numbers}) == len(numbers) and self._places.keys().isdisjoint(numbers)

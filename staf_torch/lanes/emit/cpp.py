@@ -14,8 +14,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
 from typing import ClassVar
 
-from ..trace.graph import FIXED, FLAG, IN_PLACE, NARROW, NOW, REAL, ROW, STEP, WHOLE, Graph, Sizes
-from .schedule import Schedule, evenly
+from ..trace.graph import FLAG, IN_PLACE, NARROW, NOW, REAL, ROW, STEP, WHOLE, Graph, Sizes
+from .schedule import Schedule, constants, evenly
 from .tables import TableWriter, Text
 
 _FEW = 400  # nodes of a program of which two vectors fit the registers and caches side by side
@@ -25,25 +25,9 @@ _LIBRARY = frozenset(("exp", "expm1", "log", "log1p", "sin", "cos", "tan", "tanh
 _MANY = 1500  # nodes of which even a matrix that the vectors share does not pay for twice the text
 _NEAR = 32  # numbers that loops collected, of each time and row
 _COSTLY, _MEMORY = 20, 4  # operations that a function takes, and that a number written and read is worth
-_FUNCTIONS = frozenset(
-    ("exp", "expm1", "log", "log1p", "sin", "cos", "tan", "tanh", "atan2", "pow", "sqrt", "div")
-)
-_FREE = frozenset(
-    (
-        "const",
-        "param",
-        "row",
-        "now",
-        "state",
-        "elem",
-        "carry",
-        "result",
-        "carrys",
-        "results",
-        "collect",
-        "pack",
-    )
-) | {"loop"}
+_FUNCTIONS = _LIBRARY | {"atan2", "pow", "sqrt", "div"}
+_OF_NO_WORK = "const param row now state elem carry result carrys results collect pack loop"
+_FREE = frozenset(_OF_NO_WORK.split())
 _MOST_WORK = 2**30  # so that products with it are numbers of 64 bits
 
 
@@ -319,7 +303,7 @@ class _CppWriter(TableWriter):
     def _panels(self, node: int) -> None:
         """Products with a matrix of the table by a function of their own, which has all registers."""
         graph, (outs, count, *places) = self.graph, self.graph.aux[node]
-        known = [self._is_constant(a) for a in graph.args[node]]
+        known = [constants(graph, a) for a in graph.args[node]]
         indices = [evenly(place, [outs, count]) for place in places]
         matrix, vector = (0, 1) if known[0] else (1, 0)
         (by, at), x = (indices[matrix], indices[vector]), graph.args[node][vector]
@@ -330,10 +314,6 @@ class _CppWriter(TableWriter):
         sizes = ", ".join(map(str, (outs, count, row, step, at[0][1])))
         table = f"c + {self._entries_of(graph.args[node][matrix]) + first}"
         return self._line(f"products<{sizes}>({table}, {self._name(x)} + {at[1]}, a{node});")
-
-    def _is_constant(self, array: int) -> bool:
-        graph = self.graph
-        return graph.op[array] == "pack" and all(graph.op[a] in FIXED for a in graph.args[array])
 
     def _has_name(self, array: int) -> bool:
         """Return whether an array of numbers lies in memory of its own."""

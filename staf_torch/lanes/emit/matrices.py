@@ -16,7 +16,7 @@ import functools
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -26,10 +26,16 @@ from .schedule import evenly, leaves
 from .statements import StatementWriter
 
 Index = tuple[list[int], int]
+_COLUMNS = 5  # of a solution that are in registers at once
+_ARRAYS = {"a": "", "h": "_1", "v": "_2", "w": "_3"}
+"""What of an operation is in arrays: its result, the triangle, the vector of a reflection and its image."""
 
 
-class ProductWriter(StatementWriter):
-    """Writes sums of products; those of two matrices in memory by squares of the result."""
+class MatrixWriter(StatementWriter):
+    """Writes, besides numbers and arrays, sums of products and operations on matrices in memory.
+
+    Products of two matrices are written by squares of the result.
+    """
 
     _side: ClassVar[int] = 0  # rows and columns of a square at most; 0 for none
 
@@ -108,47 +114,34 @@ class ProductWriter(StatementWriter):
             if rows == 0 or passes == 0:
                 continue
             with self._braces(f"for (int p = {start}; p < {start + rows * passes}; p += {rows})"):
-                for r in range(rows):
-                    for j in range(self.copies):
-                        first = self._product(node, indices, places, r, "0", j)[2]
-                        self._line(f"{kind} r{r}{self._copy(j)} = {rounded(first)};")
+                every = [*itertools.product(range(rows), range(self.copies))]
+                for r, j in every:
+                    first = " * ".join(self._factors(node, indices, r, "0", j))
+                    self._line(f"{kind} r{r}{self._copy(j)} = {rounded(first)};")
                 with self._braces(f"for (int q = 1; q < {count}; ++q)"):
-                    for r in range(rows):
-                        for j in range(self.copies):
-                            a, b, _ = self._product(node, indices, places, r, "q", j)
-                            name = f"r{r}{self._copy(j)}"
-                            self._line(f"{name} = {rounded(self._fma(a, b, name))};")
-                for r in range(rows):
-                    for j in range(self.copies):
-                        self._line(f"a{node}[(p + {r}) * {self.copies} + {j}] = r{r}{self._copy(j)};")
+                    for r, j in every:
+                        name = f"r{r}{self._copy(j)}"
+                        self._line(
+                            f"{name} = {rounded(self._fma(*self._factors(node, indices, r, 'q', j), name))};"
+                        )
+                for r, j in every:
+                    self._line(f"a{node}[(p + {r}) * {self.copies} + {j}] = r{r}{self._copy(j)};")
 
-    def _product(self, node: int, indices: Any, places: Any, r: int, q: str, j: int) -> tuple[str, str, str]:
+    def _factors(self, node: int, indices: Sequence[Index | None], r: int, q: str, j: int) -> list[str]:
+        """Product q of sum p + r."""
         count, values = self.graph.aux[node][1], []
-        for operand, place, index in zip(self.graph.args[node], places, indices, strict=True):
+        for operand, place, index in zip(
+            self.graph.args[node], self.graph.aux[node][2:], indices, strict=True
+        ):
             if place is None:
                 values.append(self._ref(operand, j))
             elif index is not None:
                 values.append(self._read(operand, self._sum([f"(p + {r})", q], *index), j))
             else:
                 values.append(self._read(operand, self._lookup(place, f"(p + {r}) * {count} + {q}"), j))
-        return values[0], values[1], f"{values[0]} * {values[1]}"
+        return values
 
-
-def cuts(size: int, widest: int) -> Iterator[tuple[int, int, int]]:
-    """Begin, end and width of the pieces of a length: as many alike as there are, and what is left."""
-    width = min(size, min(range(widest, widest // 2, -1), key=lambda width: -(-size // width) * width))
-    whole = size // width * width
-    yield 0, whole, width
-    if whole < size:
-        yield whole, size, size - whole
-
-
-_ARRAYS = {"a": "", "h": "_1", "v": "_2", "w": "_3"}
-"""What of the operation is in arrays: its result, the triangle, the vector of a reflection and its image."""
-
-
-class MatrixWriter(ProductWriter):
-    """Writes, besides numbers and arrays, Householder's tridiagonal form of a symmetric matrix."""
+    # Householder's tridiagonal form.
 
     def _tridiagonal(self, node: int) -> None:
         """Loops over the lower triangle, in place: Golub and Van Loan, 8.3.1.
@@ -156,197 +149,140 @@ class MatrixWriter(ProductWriter):
         The matrix is divided by its largest |entry| first. The array of the node is then its diagonal, the
         squares of what is beside it, and that entry.
         """
-        size, end = self.graph.aux[node][1][0], self.graph.aux[node][1][0] - 1
+        size, every = self.graph.aux[node][1][0], self._every(node)
         self._declare(node)
         self._read_triangle(node, size)
         with self._over("i0_0", "0", size - 2):
             self._reflector(node, size)
             self._image(node, size)
             with self._over("i0_1", "i0_0 + 1", size), self._over("i0_2", "i0_0 + 1", "i0_1 + 1"):
-                for j in range(self.copies):
-                    h = self._part("h", node, _packed("i0_1", "i0_2"), j)
-                    v, w, across, beside = (self._part(x, node, u, j) for u in ("i0_1", "i0_2") for x in "vw")
-                    self._line(f"{h} = {h} - ({self._fma(v, beside, f'{w} * {across}')});")
-        for j in range(self.copies):
-            side = self._part("h", node, _packed(str(end), str(end - 1)), j)
-            for k in (end - 1, end):
-                self._line(
-                    f"{self._part('a', node, str(k), j)} = "
-                    f"{self._part('h', node, _packed(str(k), str(k)), j)};"
-                )
-            self._line(f"{self._part('a', node, str(2 * size - 2), j)} = {side} * {side};")
+                for c in every:
+                    h, v, w = c("h", _packed("i0_1", "i0_2")), c("v", "i0_1"), c("w", "i0_1")
+                    moved = self._fma(v, c("w", "i0_2"), f"{w} * {c('v', 'i0_2')}")
+                    self._line(f"{h} = {h} - ({moved});")
+        for c in every:
+            for k in (size - 2, size - 1):
+                self._line(f"{c('a', k)} = {c('h', _packed(k, k))};")
+            side = c("h", _packed(size - 1, size - 2))
+            self._line(f"{c('a', 2 * size - 2)} = {side} * {side};")
 
     def _read_triangle(self, node: int, size: int) -> None:
         """Copy the lower triangle, over its largest |entry|, into an array of its own."""
-        kind, count = self._type(node), size * (size + 1) // 2
+        every, count = self._every(node), size * (size + 1) // 2
         for name, entries in (("h", count), ("v", size), ("w", size)):
-            self._line(f"{kind} a{node}{_ARRAYS[name]}[{entries * self.copies}];")
+            self._line(f"{self._type(node)} a{node}{_ARRAYS[name]}[{entries * self.copies}];")
         self._variables(node, 1, 0.0)
         with self._over("i0_0", "0", size), self._over("i0_1", "0", "i0_0 + 1"):
             ats = self._entry_of_each(node, [size, size])
-            for j in range(self.copies):
-                h, most = self._part("h", node, _packed("i0_0", "i0_1"), j), f"t{node}_1{self._copy(j)}"
-                self._line(f"{h} = {self._mapped(node, iter(ats), j)};")
-                length = self._op("abs", node, h)
-                self._line(
-                    f"{most} = {self._op('where', node, self._op('lt', node, most, length), length, most)};"
-                )
-        for j in range(self.copies):
-            most = f"t{node}_1{self._copy(j)}"
-            some = self._op("lt", node, self._stated(0.0, self.graph.type[node]), most)
-            one = self._stated(1.0, self.graph.type[node])
-            self._line(f"{most} = {self._op('where', node, some, most, one)};")
-            self._line(f"{self._part('a', node, str(2 * size - 1), j)} = {most};")
+            for c in every:
+                h, most = c("h", _packed("i0_0", "i0_1")), c.variable(1)
+                self._line(f"{h} = {self._mapped(node, iter(ats), c.j)};")
+                length = c.op("abs", h)
+                self._line(f"{most} = {c.op('where', c.op('lt', most, length), length, most)};")
+        for c in every:
+            most = c.variable(1)
+            some = c.op("lt", c.stated(0.0), most)
+            self._line(f"{most} = {c.op('where', some, most, c.stated(1.0))};")
+            self._line(f"{c('a', 2 * size - 1)} = {most};")
         with self._over("i0_0", "0", count):
-            for j in range(self.copies):
-                h = self._part("h", node, "i0_0", j)
-                self._line(f"{h} = {h} / t{node}_1{self._copy(j)};")
-
-    def _entry_of_each(self, node: int, sizes: list[int], at: Sequence[str] = ("i0_0", "i0_1")) -> list[str]:
-        """Return where an entry of a matrix is in each of what is read."""
-        found = []
-        for _, places in leaves(self.graph, self._taken_over, node):
-            index = evenly(places, sizes)
-            regular = None if index is None else self._sum(at, *index)
-            found.append(
-                self._lookup(places, f"{at[0]} * {sizes[1]} + {at[1]}") if regular is None else regular
-            )
-        return found
+            for c in every:
+                self._line(f"{c('h', 'i0_0')} = {c('h', 'i0_0')} / {c.variable(1)};")
 
     def _reflector(self, node: int, size: int) -> None:
         """Column i0_0 below the diagonal as the vector v of a reflection, scaled by x = 2 / v'v."""
-        zero, one, two = (self._stated(value, self.graph.type[node]) for value in (0.0, 1.0, 2.0))
+        every = self._every(node)
         self._variables(node, 2, 0.0)
         with self._over("i0_1", "i0_0 + 1", size):
-            for j in range(self.copies):
-                v, square = self._part("v", node, "i0_1", j), f"t{node}_2{self._copy(j)}"
-                self._line(f"{v} = {self._part('h', node, _packed('i0_1', 'i0_0'), j)};")
-                self._line(f"{self._part('w', node, 'i0_1', j)} = {zero};")
+            for c in every:
+                v, square = c("v", "i0_1"), c.variable(2)
+                self._line(f"{v} = {c('h', _packed('i0_1', 'i0_0'))};")
+                self._line(f"{c('w', 'i0_1')} = {c.stated(0.0)};")
                 self._line(f"{square} = {self._fma(v, v, square)};")
-        for j in range(self.copies):
-            square, factor = f"t{node}_2{self._copy(j)}", f"t{node}_1{self._copy(j)}"
-            head, root = self._part("v", node, "i0_0 + 1", j), self._op("sqrt", node, square)
-            self._line(
-                f"{self._part('a', node, 'i0_0', j)} = {self._part('h', node, _packed('i0_0', 'i0_0'), j)};"
-            )
-            self._line(f"{self._part('a', node, f'i0_0 + {size}', j)} = {square};")
-            self._line(f"{factor} = {root};")
-            moved = self._op(
-                "where", node, self._op("lt", node, head, zero), f"{head} - {factor}", f"{head} + {factor}"
-            )
+        for c in every:
+            head, square, factor, zero = c("v", "i0_0 + 1"), c.variable(2), c.variable(1), c.stated(0.0)
+            self._line(f"{c('a', 'i0_0')} = {c('h', _packed('i0_0', 'i0_0'))};")
+            self._line(f"{c('a', f'i0_0 + {size}')} = {square};")
+            self._line(f"{factor} = {c.op('sqrt', square)};")
+            moved = c.op("where", c.op("lt", head, zero), f"{head} - {factor}", f"{head} + {factor}")
             self._line(f"{head} = {moved};")
             self._line(f"{square} = {zero};")
         with self._over("i0_1", "i0_0 + 1", size):
-            for j in range(self.copies):
-                v, square = self._part("v", node, "i0_1", j), f"t{node}_2{self._copy(j)}"
+            for c in every:
+                v, square = c("v", "i0_1"), c.variable(2)
                 self._line(f"{square} = {self._fma(v, v, square)};")
-        for j in range(self.copies):
-            square, factor = f"t{node}_2{self._copy(j)}", f"t{node}_1{self._copy(j)}"
-            some = self._op("lt", node, zero, square)
-            self._line(f"{factor} = {two} / ({self._op('where', node, some, square, one)});")
-            self._line(f"{factor} = {self._op('where', node, some, factor, zero)};")
+        for c in every:
+            square, factor = c.variable(2), c.variable(1)
+            some = c.op("lt", c.stated(0.0), square)
+            self._line(f"{factor} = {c.stated(2.0)} / ({c.op('where', some, square, c.stated(1.0))});")
+            self._line(f"{factor} = {c.op('where', some, factor, c.stated(0.0))};")
 
     def _image(self, node: int, size: int) -> None:
         """w = x H v - x/2 (x v'H v) v."""
-        zero = self._stated(0.0, self.graph.type[node])
+        every = self._every(node)
+
+        def cleared() -> None:
+            for c in every:
+                self._line(f"{c.variable(2)} = {c.stated(0.0)};")
+
         with self._over("i0_1", "i0_0 + 1", size):
-            for j in range(self.copies):
-                self._line(f"t{node}_2{self._copy(j)} = {zero};")
+            cleared()
             with self._over("i0_2", "i0_0 + 1", "i0_1"):
-                for j in range(self.copies):
-                    h, total = self._part("h", node, _packed("i0_1", "i0_2"), j), f"t{node}_2{self._copy(j)}"
-                    v, across, w = (
-                        self._part(x, node, u, j) for x, u in (("v", "i0_1"), ("v", "i0_2"), ("w", "i0_2"))
-                    )
-                    self._line(f"{total} = {self._fma(h, across, total)};")
-                    self._line(f"{w} = {self._fma(h, v, w)};")
-            for j in range(self.copies):
-                h, total = self._part("h", node, _packed("i0_1", "i0_1"), j), f"t{node}_2{self._copy(j)}"
-                v, w = (self._part(x, node, "i0_1", j) for x in "vw")
-                self._line(f"{w} = {w} + ({self._fma(h, v, total)});")
-        for j in range(self.copies):
-            self._line(f"t{node}_2{self._copy(j)} = {zero};")
+                for c in every:
+                    h, w, total = c("h", _packed("i0_1", "i0_2")), c("w", "i0_2"), c.variable(2)
+                    self._line(f"{total} = {self._fma(h, c('v', 'i0_2'), total)};")
+                    self._line(f"{w} = {self._fma(h, c('v', 'i0_1'), w)};")
+            for c in every:
+                h, v, w = c("h", _packed("i0_1", "i0_1")), c("v", "i0_1"), c("w", "i0_1")
+                self._line(f"{w} = {w} + ({self._fma(h, v, c.variable(2))});")
+        cleared()
         with self._over("i0_1", "i0_0 + 1", size):
-            for j in range(self.copies):
-                v, w = (self._part(x, node, "i0_1", j) for x in "vw")
-                total = f"t{node}_2{self._copy(j)}"
-                self._line(f"{w} = {w} * t{node}_1{self._copy(j)};")
+            for c in every:
+                v, w, total = c("v", "i0_1"), c("w", "i0_1"), c.variable(2)
+                self._line(f"{w} = {w} * {c.variable(1)};")
                 self._line(f"{total} = {self._fma(w, v, total)};")
-        for j in range(self.copies):
-            half = self._stated(0.5, self.graph.type[node])
-            total = f"t{node}_2{self._copy(j)}"
-            self._line(f"{total} = {half} * t{node}_1{self._copy(j)} * {total};")
+        for c in every:
+            self._line(f"{c.variable(2)} = {c.stated(0.5)} * {c.variable(1)} * {c.variable(2)};")
         with self._over("i0_1", "i0_0 + 1", size):
-            for j in range(self.copies):
-                v, w = (self._part(x, node, "i0_1", j) for x in "vw")
-                self._line(f"{w} = {w} - t{node}_2{self._copy(j)} * {v};")
+            for c in every:
+                self._line(f"{c('w', 'i0_1')} = {c('w', 'i0_1')} - {c.variable(2)} * {c('v', 'i0_1')};")
 
-    def _variables(self, node: int, name: int, value: float) -> None:
-        for j in range(self.copies):
-            stated = self._stated(value, self.graph.type[node])
-            self._line(f"{self._type(node)} t{node}_{name}{self._copy(j)} = {stated};")
-
-    def _part(self, name: str, node: int, at: str, j: int) -> str:
-        """An entry of an array of the node's own."""
-        name = f"a{node}{_ARRAYS[name]}"
-        return f"{name}[{at}]" if self.copies == 1 else f"{name}[({at}) * {self.copies} + {j}]"
-
-    def _op(self, op: str, node: int, *values: str) -> str:
-        return self._operation(op, values, self.graph.type[node])
-
-
-def _packed(row: str, column: str) -> str:
-    """The place of an entry of a lower triangle, row by row."""
-    return f"({row}) * (({row}) + 1) / 2 + {column}"
-
-
-_COLUMNS = 5  # of a solution that are in registers at once
-
-
-class EliminationWriter(MatrixWriter):
-    """Writes, besides, Cholesky's factor and the solution under a lower triangle, in an array of the node.
-
-    Each entry is computed as by the passes over whole matrices in `trace.factorisations`, in their order.
-    """
+    # Eliminations: each entry as by the passes over whole matrices in `trace.factorisations`, in their order.
 
     def _cholesky(self, node: int) -> None:
         """L, and after it 0 or the place of a pivot that is not positive."""
-        size = self.graph.aux[node][1][0]
+        size, every = self.graph.aux[node][1][0], self._every(node)
+        pivot, entry = f"i0_0 * {size} + i0_0", f"i0_1 * {size} + i0_0"
         self._declare(node)
         self._variables(node, 1, 0.0)  # the place
         self._variables(node, 2, 1.0)  # of this pass
         with self._over("i0_0", "0", size):
             with self._over("i0_1", "i0_0", size):
                 ats = self._entry_of_each(node, [size, size], ("i0_1", "i0_0"))
-                self._sums(node, "sum", lambda j: self._mapped(node, iter(ats), j))
+                self._begin_with(node, "sum", lambda j: self._mapped(node, iter(ats), j))
                 with self._over("i0_2", "0", "i0_0"):
-                    for j in range(self.copies):
-                        one, other = (
-                            self._part("a", node, f"{at} * {size} + i0_2", j) for at in ("i0_1", "i0_0")
+                    for c in every:
+                        one, other, total = (
+                            *(c("a", f"{at} * {size} + i0_2") for at in ("i0_1", "i0_0")),
+                            f"sum{c.end}",
                         )
-                        self._line(f"sum{self._copy(j)} = sum{self._copy(j)} - {one} * {other};")
-                for j in range(self.copies):
-                    entry = self._part("a", node, f"i0_1 * {size} + i0_0", j)
-                    self._line(f"{entry} = sum{self._copy(j)};")
-            for j in range(self.copies):
-                failed, done, root = (f"t{node}_{k}{self._copy(j)}" for k in (1, 2, 3))
-                zero, one = (self._stated(value, self.graph.type[node]) for value in (0.0, 1.0))
-                pivot = self._part("a", node, f"i0_0 * {size} + i0_0", j)
-                first = self._op("where", node, self._op("eq", node, failed, zero), done, failed)
-                fine = self._op("lt", node, zero, pivot)
-                self._line(f"{failed} = {self._op('where', node, fine, failed, first)};")
-                self._line(f"{done} = {done} + {one};")
-                self._line(f"const {self._type(node)} {root} = {self._op('sqrt', node, pivot)};")
+                        self._line(f"{total} = {total} - {one} * {other};")
+                for c in every:
+                    self._line(f"{c('a', entry)} = sum{c.end};")
+            for c in every:
+                failed, done = c.variable(1), c.variable(2)
+                first = c.op("where", c.op("eq", failed, c.stated(0.0)), done, failed)
+                fine = c.op("lt", c.stated(0.0), c("a", pivot))
+                self._line(f"{failed} = {c.op('where', fine, failed, first)};")
+                self._line(f"{done} = {done} + {c.stated(1.0)};")
+                self._line(f"const {self._type(node)} {c.variable(3)} = {c.op('sqrt', c('a', pivot))};")
             with self._over("i0_1", "i0_0", size):
-                for j in range(self.copies):
-                    entry = self._part("a", node, f"i0_1 * {size} + i0_0", j)
-                    self._line(f"{entry} = {entry} / t{node}_3{self._copy(j)};")
+                for c in every:
+                    self._line(f"{c('a', entry)} = {c('a', entry)} / {c.variable(3)};")
         with self._over("i0_1", "0", size), self._over("i0_2", "i0_1 + 1", size):
-            for j in range(self.copies):
-                zero = self._stated(0.0, self.graph.type[node])
-                self._line(f"{self._part('a', node, f'i0_1 * {size} + i0_2', j)} = {zero};")
-        for j in range(self.copies):
-            self._line(f"{self._part('a', node, str(size * size), j)} = t{node}_1{self._copy(j)};")
+            for c in every:
+                self._line(f"{c('a', f'i0_1 * {size} + i0_2')} = {c.stated(0.0)};")
+        for c in every:
+            self._line(f"{c('a', size * size)} = {c.variable(1)};")
 
     def _substitute(self, node: int, unit: bool = False) -> None:
         """T^-1 B beside the place of T, row by row: some columns at a time."""
@@ -359,48 +295,38 @@ class EliminationWriter(MatrixWriter):
 
     def _substituted(self, node: int, size: int, row: int, width: int, unit: bool) -> None:
         """Entries of row i0_0 of the solution."""
-        read = self._sides(node)
-        for c in range(width):
-            for j in range(self.copies):
-                self._line(f"{self._type(node)} r{c}{self._copy(j)} = {read(1, f'(i0_1 + {c})', j)};")
+        read, columns = self._sides(node), [*itertools.product(range(width), self._every(node))]
+        for k, c in columns:
+            self._line(f"{self._type(node)} r{k}{c.end} = {read(1, f'(i0_1 + {k})', c.j)};")
         with self._over("i0_2", "0", "i0_0"):
-            self._sums(node, "x", lambda j: read(0, "i0_2", j))
-            for c, j in itertools.product(range(width), range(self.copies)):
-                other = self._part("a", node, f"i0_2 * {row} + i0_1 + {size + c}", j)
-                self._line(f"r{c}{self._copy(j)} = r{c}{self._copy(j)} - x{self._copy(j)} * {other};")
+            self._begin_with(node, "x", lambda j: read(0, "i0_2", j))
+            for k, c in columns:
+                other = c("a", f"i0_2 * {row} + i0_1 + {size + k}")
+                self._line(f"r{k}{c.end} = r{k}{c.end} - x{c.end} * {other};")
         if not unit:
-            self._sums(node, "x", lambda j: read(0, "i0_0", j))
-        for c, j in itertools.product(range(width), range(self.copies)):
-            entry = self._part("a", node, f"i0_0 * {row} + i0_1 + {size + c}", j)
-            self._line(f"{entry} = r{c}{self._copy(j)}{'' if unit else f' / x{self._copy(j)}'};")
+            self._begin_with(node, "x", lambda j: read(0, "i0_0", j))
+        for k, c in columns:
+            entry = c("a", f"i0_0 * {row} + i0_1 + {size + k}")
+            self._line(f"{entry} = r{k}{c.end}{'' if unit else f' / x{c.end}'};")
 
     def _substitute_unit(self, node: int) -> None:
         self._substitute(node, unit=True)
-
-    def _sums(self, node: int, name: str, value: Callable[[int], str]) -> None:
-        """Declare a variable that begins with a value."""
-        for j in range(self.copies):
-            self._line(f"{self._type(node)} {name}{self._copy(j)} = {value(j)};")
 
     def _sides(self, node: int) -> Callable[[int, str, int], str]:
         """Return what reads an entry of row i0_0 of T (0) or of B (1)."""
         size, row = self.graph.aux[node][1]
         apart = self._apart(node)
-        if apart is None:
 
-            def read(side: int, column: str, j: int) -> str:
-                ats = self._entry_of_each(node, [size, row], ("i0_0", f"({column} + {side * size})"))
-                return self._mapped(node, iter(ats), j)
-
-        else:
-
-            def read(side: int, column: str, j: int) -> str:
+        def read(side: int, column: str, j: int) -> str:
+            if apart is not None:
                 entry, index = apart[side]
                 return self._read_like(entry, self._sum(["i0_0", column], *index), j)
+            ats = self._entry_of_each(node, [size, row], ("i0_0", f"({column} + {side * size})"))
+            return self._mapped(node, iter(ats), j)
 
         return read
 
-    def _apart(self, node: int) -> list[tuple[int, tuple[list[int], int]]] | None:
+    def _apart(self, node: int) -> list[tuple[int, Index]] | None:
         """An entry of T and of B and where the others lie, if an array is there for them alone; else None."""
         graph, (pack,), (_, (size, row), places) = self.graph, self.graph.args[node], self.graph.aux[node]
         alone = self.schedule.uses[pack] == 1 and self.schedule.together(pack, node)
@@ -427,3 +353,61 @@ class EliminationWriter(MatrixWriter):
         graph = self.graph
         of = [n for n in self.schedule.live if graph.op[n] in ("substitute", "substitute_unit")]
         return {graph.args[n][0]: n for n in of}
+
+    # What these have in common.
+
+    def _every(self, node: int) -> list[_Copy]:
+        return [_Copy(self, node, j) for j in range(self.copies)]
+
+    def _entry_of_each(self, node: int, sizes: list[int], at: Sequence[str] = ("i0_0", "i0_1")) -> list[str]:
+        """Return where an entry of a matrix is in each of what is read."""
+        found = []
+        for _, places in leaves(self.graph, self._taken_over, node):
+            index = evenly(places, sizes)
+            irregular = f"{at[0]} * {sizes[1]} + {at[1]}"
+            found.append(self._lookup(places, irregular) if index is None else self._sum(at, *index))
+        return found
+
+    def _variables(self, node: int, number: int, value: float) -> None:
+        self._begin_with(node, f"t{node}_{number}", lambda _: self._stated(value, self.graph.type[node]))
+
+    def _begin_with(self, node: int, name: str, value: Callable[[int], str]) -> None:
+        """Declare a variable that begins with a value."""
+        for j in range(self.copies):
+            self._line(f"{self._type(node)} {name}{self._copy(j)} = {value(j)};")
+
+
+class _Copy:
+    """The spelling of what an operation on a matrix reads and writes, in one of the copies."""
+
+    def __init__(self, writer: MatrixWriter, node: int, j: int) -> None:
+        self._writer, self._node, self._kind = writer, node, writer.graph.type[node]
+        self.j, self.end = j, writer._copy(j)
+
+    def __call__(self, array: str, at: str | int) -> str:
+        """An entry of an array of the node's own."""
+        name, copies = f"a{self._node}{_ARRAYS[array]}", self._writer.copies
+        return f"{name}[{at}]" if copies == 1 else f"{name}[({at}) * {copies} + {self.j}]"
+
+    def variable(self, number: int) -> str:
+        return f"t{self._node}_{number}{self.end}"
+
+    def op(self, op: str, *values: str) -> str:
+        return self._writer._operation(op, values, self._kind)
+
+    def stated(self, value: float) -> str:
+        return self._writer._stated(value, self._kind)
+
+
+def _packed(row: str | int, column: str | int) -> str:
+    """The place of an entry of a lower triangle, row by row."""
+    return f"({row}) * (({row}) + 1) / 2 + {column}"
+
+
+def cuts(size: int, widest: int) -> Iterator[tuple[int, int, int]]:
+    """Begin, end and width of the pieces of a length: as many alike as there are, and what is left."""
+    width = min(size, min(range(widest, widest // 2, -1), key=lambda width: -(-size // width) * width))
+    whole = size // width * width
+    yield 0, whole, width
+    if whole < size:
+        yield whole, size, size - whole

@@ -255,27 +255,8 @@ def taken_over(graph: Graph, schedule: Schedule) -> set[int]:
     return found
 
 
-_CHEAP = frozenset(
-    [
-        "add",
-        "sub",
-        "mul",
-        "neg",
-        "abs",
-        "min",
-        "max",
-        "where",
-        "copy",
-        "lt",
-        "le",
-        "eq",
-        "ne",
-        "and",
-        "or",
-        "xor",
-        "not",
-    ]
-)
+_SIMPLE = "add sub mul neg abs min max where copy lt le eq ne and or xor not"
+_CHEAP = frozenset(_SIMPLE.split())
 _SHORT = 6  # operations of an entry that is made again
 
 
@@ -301,13 +282,14 @@ def made_again(graph: Graph, schedule: Schedule, least: int) -> set[int]:
         if graph.op[node] != "map" or graph.aux[node][0] not in _CHEAP or graph.size(node) <= least:
             continue
         arrays = [operand for operand in graph.args[node] if graph.size(operand) > least]
-        more = sum(length.get(operand, 0 if _fixed(graph, operand) else _SHORT) for operand in arrays)
+        more = sum(length.get(operand, 0 if constants(graph, operand) else _SHORT) for operand in arrays)
         if more < _SHORT and here(node):
             length[node] = 1 + more
     return set(length)
 
 
-def _fixed(graph: Graph, array: int) -> bool:
+def constants(graph: Graph, array: int) -> bool:
+    """Return whether an array has numbers alone that are the same for all rows and times."""
     return graph.op[array] == "pack" and all(graph.op[node] in FIXED for node in graph.args[array])
 
 

@@ -10,9 +10,9 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from ..trace.graph import EXACT, FIXED, IN_PLACE, NARROW, Graph, Sizes
+from ..trace.graph import EXACT, IN_PLACE, NARROW, Graph, Sizes
 from ..trace.tracer import NotLoweredError
-from .schedule import Schedule, evenly, leaves
+from .schedule import Schedule, constants, evenly, leaves
 
 _SHORTEST = 4  # entries that are worth a loop
 
@@ -374,7 +374,7 @@ class StatementWriter(abc.ABC):
         graph = self.graph
         if array in self._remade:
             return f"({self._made_again(array, at, j)})"
-        if graph.op[array] == "pack" and all(graph.op[a] in FIXED for a in graph.args[array]):
+        if constants(graph, array):
             return self._table(array, at)
         if array in self._stored:
             return self._typed(array, self._buffer(*self._stored[array], j, at))
@@ -417,7 +417,7 @@ class StatementWriter(abc.ABC):
             return None
         args = graph.args[pack]
         op = graph.op[args[0]]
-        if op in FIXED and all(graph.op[a] in FIXED for a in args):
+        if constants(graph, pack):
             return "table", 0
         if op == "state":  # nothing is written there before the end of a step
             slot, start = graph.aux[args[0]]

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..trace.graph import Graph, Sizes
 from ..trace.tracer import LARGE
-from .matrices import EliminationWriter
+from .matrices import MatrixWriter
 from .schedule import Schedule, ends_with, taken_over
 
 
@@ -31,7 +31,7 @@ class Text(NamedTuple):
         return table.to(real)
 
 
-class TableWriter(EliminationWriter):
+class TableWriter(MatrixWriter):
     """A writer of programs that run for many rows and times.
 
     Attributes:
