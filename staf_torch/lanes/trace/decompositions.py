@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 import inspect
-import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -18,7 +17,7 @@ import torch
 from torch import Tensor
 from torch._decomp import decomposition_table
 
-from .graph import WHOLE, Ids
+from .graph import Ids
 from .loops import repeat, scan
 from .tracer import LARGE, NotLoweredError, Tracer
 
@@ -31,15 +30,9 @@ MOVEMENTS = frozenset(_MOVEMENTS.split())
 
 def moved(t: Tracer, func: Any, out: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
     """The nodes of what an operation of `MOVEMENTS` returns; arguments as of `step.lower`."""
-    name = func._schema.name.removeprefix("aten::").removesuffix("_")
-    named = [argument.name for argument in func._schema.arguments]
-    at = next((k for k, argument in enumerate(named) if argument in ("index", "indices")), None)
+    name, at = func._schema.name.removeprefix("aten::").removesuffix("_"), _place_of_index(func)
     if name == "index_put" and (kwargs.get("accumulate") or (len(args) > 3 and args[3])):
         return _accumulated(t, out, *args[:3])
-    if at is not None and any(
-        isinstance(i, Tensor) and (t.traced(i) or not t.stated(i)) for i in _listed(args[at])
-    ):
-        return _indexed(t, name, out, *args, **kwargs)
     kind = t.kind(out.dtype)
     zero = t.graph.constant(0.0, kind)
 
@@ -59,26 +52,43 @@ def moved(t: Tracer, func: Any, out: Any, args: Sequence[Any], kwargs: dict[str,
     return result.numpy() + zero
 
 
-def added_at(t: Tracer, out: Tensor, a: Tensor, dim: int, index: Tensor, source: Tensor) -> Ids:
-    """Entries added at places along a dimension, also at such as the row computes: the slope of `gather`."""
-    kind = t.kind(out.dtype)
-    total = np.moveaxis(t.nodes(a, kind), dim, -1).copy()
-    at = np.moveaxis(t.nodes(index, WHOLE), dim, -1)
-    added = np.moveaxis(t.nodes(source, kind), dim, -1)
-    inner = tuple(slice(size) for size in at.shape[:-1])
-    part, added, nothing = total[inner], added[inner], t.nodes(0.0, kind)
-    for s in range(at.shape[-1]):
-        for k in range(total.shape[-1]):
-            here = t.map("eq", at[..., s], t.nodes(k, WHOLE))
-            part[..., k] = t.map("add", part[..., k], t.map("where", here, added[..., s], nothing))
-    return np.moveaxis(total, -1, dim)
+@functools.cache
+def _place_of_index(func: Any) -> int | None:
+    named = [argument.name for argument in func._schema.arguments]
+    return next((k for k, argument in enumerate(named) if argument in ("index", "indices")), None)
+
+
+def choice(
+    t: Tracer, func: Any, name: str, args: Sequence[Any], kwargs: dict[str, Any]
+) -> Callable[..., Tensor] | None:
+    """Return the operation of `CHOICES` where the row, or the table, says at which index; else None."""
+    at = _place_of_index(func) if name in MOVEMENTS or name in CHOICES else None
+    index = () if at is None else args[at] if isinstance(args[at], list | tuple) else (args[at],)
+    dynamic = [i for i in index if isinstance(i, Tensor) and (t.traced(i) or not t.stated(i))]
+    if not dynamic:
+        return None
+    masked = any(i.dtype == torch.bool for i in dynamic)
+    if "reduce" in kwargs:
+        raise NotLoweredError("`scatter` with reduce= cannot be compiled; `scatter_add` can")
+    if (
+        name == "index_put"
+        and masked
+        and len(index) == 1
+        and args[2].numel() == 1
+        and args[3:] in ((), (False,))
+    ):
+        return _put_by_mask
+    if masked or name not in CHOICES or sum(i is not None for i in index) > 1:
+        reason = (
+            f"`aten.{name}` at {'a mask' if masked else 'an index'} that the row computes cannot be compiled"
+        )
+        instead = "index" if masked else "scatter_add" if name == "index_put" else "gather"
+        raise NotLoweredError(reason, instead)
+    return CHOICES[name]
 
 
 def _accumulated(t: Tracer, out: Tensor, a: Tensor, index: Sequence[Tensor | None], source: Tensor) -> Ids:
     """Entries added at an index that no row computes: the slope of an entry that was read twice, say."""
-    if any(isinstance(i, Tensor) and (t.traced(i) or not t.stated(i)) for i in index):
-        reason = "`aten.index_put` at an index that the row computes cannot be compiled"
-        raise NotLoweredError(reason, "scatter_add")
     kind = t.kind(out.dtype)
     places = torch.arange(a.numel(), device="cpu").reshape(a.shape)[
         tuple(slice(None) if i is None else i.cpu() for i in index)
@@ -90,71 +100,10 @@ def _accumulated(t: Tracer, out: Tensor, a: Tensor, index: Sequence[Tensor | Non
     return nodes.reshape(a.shape)
 
 
-def _listed(value: Any) -> Sequence[Any]:
-    return value if isinstance(value, list | tuple) else [value]
-
-
-def _indexed(
-    t: Tracer,
-    name: str,
-    out: Tensor,
-    a: Tensor,
-    dim: Any,
-    index: Any = None,
-    *rest: Any,
-    reduce: str | None = None,
-    **_: Any,
-) -> Ids:
-    """gather, scatter and selection at an index that a row computes, or that numbers of the table do."""
-    kind = t.kind(out.dtype)
-    if name == "index_put" and len(dim) == 1 and dim[0].dtype == torch.bool and index.numel() == 1:
-        chosen = t.nodes(dim[0])  # y[y > 1] = 1
-        chosen = chosen.reshape(*chosen.shape, *[1] * (a.dim() - chosen.ndim))
-        return t.map("where", chosen, t.nodes(index, kind).reshape(()), t.nodes(a, kind))
-    if name == "index" and sum(i is not None for i in dim) == 1:
-        axis = next(k for k, i in enumerate(dim) if i is not None)
-        name, dim, index = "index_select", axis, dim[axis]
-    if name == "index_select" and index.dtype != torch.bool:
-        entries = np.moveaxis(t.nodes(a, kind), dim, -1)
-        chosen = _chosen(t, entries[(..., *[None] * index.dim(), slice(None))], t.nodes(index, WHOLE))
-        return np.moveaxis(chosen, range(a.dim() - 1, chosen.ndim), range(dim, dim + index.dim()))
-    if name not in ("gather", "scatter"):
-        masked = any(isinstance(i, Tensor) and i.dtype == torch.bool for i in (*_listed(dim), index))
-        reason = f"`aten.{name}` at {'a mask' if masked else 'an index'} that the row computes"
-        raise NotLoweredError(f"{reason} cannot be compiled", "index" if masked else "gather")
-    x = np.moveaxis(t.nodes(a, kind), dim, -1)
-    at = np.moveaxis(t.nodes(index, WHOLE), dim, -1)
-    if name == "gather":
-        x = x[tuple(slice(s) for s in at.shape[:-1])]
-        return np.moveaxis(_chosen(t, x[..., None, :], at), -1, dim)
-    if reduce is not None:
-        raise NotLoweredError("`scatter` with reduce= cannot be compiled; `scatter_add` can")
-    source = t.nodes(rest[0], kind)
-    source = np.broadcast_to(source, at.shape) if source.ndim == 0 else np.moveaxis(source, dim, -1)
-    source = source[tuple(slice(s) for s in at.shape)]
-    out_nodes = x.copy()
-    part = out_nodes[tuple(slice(s) for s in at.shape[:-1])]
-    for s in range(at.shape[-1]):
-        for k in range(x.shape[-1]):
-            here = t.map("eq", at[..., s], t.nodes(k, WHOLE))
-            part[..., k] = t.map("where", here, source[..., s], part[..., k])
-    return np.moveaxis(out_nodes, -1, dim)
-
-
-def _chosen(t: Tracer, x: Ids, at: Ids) -> Ids:
-    """Entry ``at`` (...) of the last dimension of arrays (..., K) that broadcast."""
-    found: Ids = np.broadcast_arrays(x[..., 0], at)[0]
-    for k in range(1, x.shape[-1]):
-        found = t.map("where", t.map("eq", at, t.nodes(k, WHOLE)), x[..., k], found)
-    return found
-
-
-def many(name: str, a: Tensor, dim: object, index: object) -> bool:
-    """Return whether so many choices are left that they stay a loop: one of `CHOICES` along a dimension."""
-    if name not in CHOICES or not isinstance(dim, int) or not isinstance(index, Tensor) or a.dim() == 0:
-        return False
-    others = 1 if name != "index_select" else a.numel() // max(1, a.shape[dim])
-    return index.dtype != torch.bool and index.numel() * a.shape[dim] * others > 2 * LARGE
+def _put_by_mask(a: Tensor, mask: Sequence[Tensor], value: Tensor, accumulate: bool = False) -> Tensor:
+    """y[mask] = one number."""
+    chosen = mask[0].reshape(*mask[0].shape, *[1] * (a.dim() - mask[0].dim()))
+    return torch.where(chosen, value.reshape(()), a)
 
 
 def gather(a: Tensor, dim: int, index: Tensor, *, sparse_grad: bool = False) -> Tensor:
@@ -167,7 +116,10 @@ def gather(a: Tensor, dim: int, index: Tensor, *, sparse_grad: bool = False) -> 
         entry, place = now
         return torch.where(at == place, entry.unsqueeze(-1), found), ()
 
-    found: Tensor = scan(choose, start, (entries, _places(a, dim)), dim=0)[0]
+    others = entries[1:], _places(a, dim)[1:]
+    found: Tensor = (
+        scan(choose, start, others, dim=0, unrolled=_few(a, dim, index))[0] if len(entries) > 1 else start
+    )
     return found.movedim(-1, dim).clone()
 
 
@@ -179,6 +131,14 @@ def index_select(a: Tensor, dim: int, index: Tensor) -> Tensor:
     return gather(a, dim, spread.expand(shape))
 
 
+def _indexed(a: Tensor, index: Sequence[Tensor | None]) -> Tensor:
+    """a[..., index], counted from the end where it is negative."""
+    dim, at = next((k, i) for k, i in enumerate(index) if i is not None)
+    at = torch.where(at < 0, at + a.shape[dim], at)
+    found = index_select(a, dim, at.reshape(-1))
+    return found.reshape(*a.shape[:dim], *at.shape, *a.shape[dim + 1 :])
+
+
 def scatter(a: Tensor, dim: int, index: Tensor, source: Tensor | float) -> Tensor:
     """A tensor with other entries at index_i along a dimension, the last of equal places: `torch.scatter`."""
     return _put(a, dim, index, source, lambda before, here, value: torch.where(here, value, before))
@@ -186,32 +146,17 @@ def scatter(a: Tensor, dim: int, index: Tensor, source: Tensor | float) -> Tenso
 
 def scatter_add(a: Tensor, dim: int, index: Tensor, source: Tensor) -> Tensor:
     """A tensor with entries added at index_i along a dimension: as `torch.scatter_add`."""
-    return _put(
-        a,
-        dim,
-        index,
-        source,
-        lambda before, here, value: before + torch.where(here, value, torch.zeros_like(value)),
-    )
+    return _put(a, dim, index, source, lambda before, here, value: before + torch.where(here, value, 0.0))
 
 
-def _put(
-    a: Tensor,
-    dim: int,
-    index: Tensor,
-    source: Tensor | float,
-    after: Callable[[Tensor, Tensor, Tensor], Tensor],
-) -> Tensor:
+Change = Callable[[Tensor, Tensor, Tensor], Tensor]
+
+
+def _put(a: Tensor, dim: int, index: Tensor, source: Tensor | float, after: Change) -> Tensor:
     at = index.movedim(dim, 0)
-    values = (
-        source.movedim(dim, 0)
-        if isinstance(source, Tensor) and source.dim()
-        else torch.as_tensor(source, device=getattr(source, "device", "cpu"))
-    )
+    values = torch.as_tensor(source, device=a.device).to(a.dtype)
     inner = tuple(slice(size) for size in at.shape[1:])
-    values = (
-        values.to(a.dtype).expand(at.shape) if values.dim() == 0 else values[(slice(at.shape[0]), *inner)]
-    )
+    values = values.movedim(dim, 0)[(slice(at.shape[0]), *inner)] if values.dim() else values.expand(at.shape)
     whole = a.movedim(dim, -1)
     place = _places(a, dim)
 
@@ -219,7 +164,7 @@ def _put(
         here, value = now
         return after(part, here.unsqueeze(-1) == place, value.unsqueeze(-1)), ()
 
-    part: Tensor = scan(put, whole[inner].clone(), (at, values), dim=0)[0]
+    part: Tensor = scan(put, whole[inner].clone(), (at, values), dim=0, unrolled=_few(a, dim, index))[0]
     if part.shape != whole.shape:
         out = whole.clone()
         out[inner] = part
@@ -231,13 +176,22 @@ def _places(a: Tensor, dim: int) -> Tensor:
     return torch.arange(a.shape[dim], device=a.device)
 
 
-CHOICES = {"gather": gather, "index_select": index_select, "scatter": scatter, "scatter_add": scatter_add}
+def _few(a: Tensor, dim: int, index: Tensor) -> bool:
+    """Return whether so few choices are left that they are written out."""
+    return index.numel() * a.shape[dim] <= 2 * LARGE
 
+
+CHOICES: dict[str, Callable[..., Tensor]] = {
+    "gather": gather,
+    "index": _indexed,
+    "index_select": index_select,
+    "scatter": scatter,
+    "scatter_add": scatter_add,
+}
 
 _OF_TORCH = "torch._decomp.decompositions"
 _TERMS = 14  # of the Taylor series; the rest is 2e-17 for a matrix of norm 1/2
 _HALVINGS = 64  # at most: beyond a norm of 1e19 nothing is left of it
-_WINITZKI = 0.147  # of a formula for erfinv with a relative error of 2e-3
 
 
 def of_torch(func: Any, args: Sequence[Any]) -> Callable[..., Any] | None:
@@ -322,14 +276,6 @@ def cumprod(x: Tensor, dim: int, *, dtype: torch.dtype | None = None) -> Tensor:
     return torch.stack(parts, dim)
 
 
-def logcumsumexp(x: Tensor, dim: int) -> Tensor:
-    """The logarithms of the sums of the exponentials so far."""
-    parts = list(x.unbind(dim)) if x.dim() else [x]
-    for k in range(1, len(parts)):
-        parts[k] = torch.logaddexp(parts[k - 1], parts[k])
-    return torch.stack(parts, dim) if x.dim() else x.clone()
-
-
 def _product(x: Tensor, dims: Sequence[int] | None, *, output_dtype: torch.dtype | None = None) -> Tensor:
     axes = range(x.dim()) if dims is None else [d % x.dim() for d in dims]
     x = x if output_dtype is None else x.to(output_dtype)
@@ -374,82 +320,9 @@ def _of_numbers(a: Tensor, b: Tensor, *, pick: Callable[[Tensor, Tensor], Tensor
     return torch.where(a.isnan(), b, torch.where(b.isnan(), a, pick(a, b)))
 
 
-def erfinv(y: Tensor) -> Tensor:
-    """x with erf(x) = y, by a closed formula (S. Winitzki, 2008) and two steps of Halley's method."""
-    tail = torch.log1p(-y * y)
-    middle = 2 / (math.pi * _WINITZKI) + 0.5 * tail
-    root = (middle * middle - tail / _WINITZKI).sqrt()
-    apart = torch.where(middle > 0, -tail / _WINITZKI / (root + middle), root - middle)  # nothing cancels
-    x = apart.sqrt().copysign(y)
-    for _ in range(2):
-        short = (torch.erf(x) - y) * (0.5 * math.sqrt(math.pi)) * (x * x).exp()
-        x = x - short / (1 + x * short)
-    return torch.where(y.abs() < 1, x, y / (1 - y * y).sqrt())
-
-
 def angle(x: Tensor) -> Tensor:
     """The angle of real numbers: 0, or pi where negative; NaN of NaN."""
     return torch.where(x < 0, torch.pi, torch.where(x != x, x, 0.0))
-
-
-def digamma(x: Tensor) -> Tensor:
-    """The slope of lgamma, as torch computes it: ten steps up, then a series in 1 / x^2 (Cephes)."""
-    left = x < 0
-    up = torch.where(left, 1 - x, x)
-    total = torch.zeros_like(x)
-    for _ in range(10):
-        total = torch.where(up < 10, total - 1 / up, total)
-        up = torch.where(up < 10, up + 1, up)
-    square, series = 1 / (up * up), torch.zeros_like(x)
-    for factor in _OF_DIGAMMA:
-        series = series * square + factor
-    found = up.log() - 0.5 / up - square * series + total
-    turned = found - math.pi / (math.pi * torch.fmod(x, 1.0)).tan()
-    found = torch.where(left, torch.where(x == x.trunc(), torch.nan, turned), found)
-    return torch.where(x == 0, torch.copysign(torch.full_like(x, torch.inf), -x), found)
-
-
-_OF_DIGAMMA = (1 / 12, -691 / 32760, 1 / 132, -1 / 240, 1 / 252, -1 / 120, 1 / 12)
-
-
-def polygamma(n: int, x: Tensor) -> Tensor:
-    """The slope of digamma, n = 1, as torch computes it: six steps up, then a series in 1 / x^2."""
-    if n == 0:
-        return digamma(x)
-    if n != 1:
-        raise NotLoweredError(f"`polygamma({n}, x)` cannot be compiled, only that of 0 and 1")
-    left = x < 0.5
-    up, total = torch.where(left, 1 - x, x), torch.zeros_like(x)
-    for _ in range(6):
-        total, up = total + 1 / (up * up), up + 1
-    square = 1 / (up * up)
-    total = total + (1 + 0.5 / up + square * (1 / 6 - square * (1 / 30 - square / 42))) / up
-    turned = math.pi / (math.pi * x).sin()
-    return torch.where(left, turned * turned - total, total)
-
-
-def _shrink_backward(slope: Tensor, x: Tensor, bound: float) -> Tensor:
-    return torch.where((x >= -bound) & (x <= bound), 0.0, slope)
-
-
-def _trilinear(
-    a: Tensor,
-    b: Tensor,
-    c: Tensor,
-    of_a: Sequence[int],
-    of_b: Sequence[int],
-    of_c: Sequence[int],
-    summed: Sequence[int],
-    unroll_dim: int = 1,
-) -> Tensor:
-    """A sum of products of three tensors, with dimensions of size 1 put into each: `torch.nn.Bilinear`."""
-    parts = []
-    for x, dims in ((a, of_a), (b, of_b), (c, of_c)):
-        for dim in dims:
-            x = x.unsqueeze(dim)
-        parts.append(x)
-    product = parts[0] * parts[1] * parts[2]
-    return product.sum(list(summed)) if summed else product
 
 
 def matrix_exponential(matrix: Tensor) -> Tensor:
@@ -480,6 +353,7 @@ def matrix_exponential(matrix: Tensor) -> Tensor:
 
 
 REPLACEMENTS: dict[str, Callable[..., Any]] = {
+    "scatter_add": scatter_add,
     "sort": sort,
     "topk": topk,
     "kthvalue": kthvalue,
@@ -487,18 +361,11 @@ REPLACEMENTS: dict[str, Callable[..., Any]] = {
     "cummax": functools.partial(_running, beats=torch.ge),
     "cummin": functools.partial(_running, beats=torch.le),
     "cumprod": cumprod,
-    "logcumsumexp": logcumsumexp,
     "prims::prod": _product,
     "prims::sum": _sum,
     "prims::var": _variance,
     "searchsorted": searchsorted,
     "angle": angle,
-    "prims::erf_inv": erfinv,
-    "prims::digamma": digamma,
-    "polygamma": polygamma,
-    "softshrink_backward": _shrink_backward,
-    "hardshrink_backward": _shrink_backward,
-    "_trilinear": _trilinear,
     "linalg_matrix_exp": matrix_exponential,
     "fmin": functools.partial(_of_numbers, pick=torch.minimum),
     "fmax": functools.partial(_of_numbers, pick=torch.maximum),

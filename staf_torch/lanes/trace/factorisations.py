@@ -3,9 +3,9 @@
 LAPACK exchanges rows where a pivot asks for it. Rows in lanes have pivots of their own, so nothing may
 branch on one: a row is chosen by comparing and selecting, and places are compared in place of exchanged. Up
 to `LARGE` entries an elimination is written out and lives in registers; above, Cholesky's and the one under
-a triangle are an operation of a program, in place. The others are loops, in which a matrix moves up by a
-row and a column after each pass, so that the text knows the first pivot alone. Eliminations by columns:
-Golub and Van Loan, Matrix Computations, ch. 3 to 5.
+a triangle are an operation of a program, in place. A solution by rows is a loop, in which a matrix moves on by
+a column after each pass, so that the text knows the first pivot alone. Eliminations by columns: Golub and
+Van Loan, Matrix Computations, ch. 3 to 5.
 
 Eigenvalues with vectors: Jacobi's rotations, M/2 disjoint pairs a pass (Brent and Luk, 1985), a fixed
 number of sweeps. Values alone: Householder's tridiagonal form and bisection (Barth, Martin and Wilkinson,
@@ -34,9 +34,12 @@ def in_memory(matrix: Tensor) -> bool:
 
 def cholesky(gram: Tensor, *, upper: bool = False, check_errors: bool = False) -> tuple[Tensor, Tensor]:
     """L with L L' = K, and 0 or, where a pivot is not positive, its place: (...)."""
-    if in_memory(gram):
-        factor, failed = _rolled_cholesky(gram)
-        return factor.mT.clone() if upper else factor, failed
+    where = _of_one(gram) if in_memory(gram) else None
+    factor, failed = _cholesky_by_columns(gram) if where is None else _cholesky_in_place(gram, *where)
+    return factor.mT.clone() if upper else factor, failed.to(torch.int32)
+
+
+def _cholesky_by_columns(gram: Tensor) -> tuple[Tensor, Tensor]:
     rest, columns = gram, []
     failed = torch.zeros_like(gram[..., 0, 0], dtype=torch.int32)
     for k in range(gram.shape[-1]):
@@ -46,8 +49,15 @@ def cholesky(gram: Tensor, *, upper: bool = False, check_errors: bool = False) -
         column = torch.cat((torch.zeros_like(gram[..., :k, k]), below), dim=-1)
         columns.append(column)
         rest = rest - column.unsqueeze(-1) * column.unsqueeze(-2)
-    factor = torch.stack(columns, dim=-1)
-    return factor.mT.clone() if upper else factor, failed.to(torch.int32)
+    return torch.stack(columns, dim=-1), failed
+
+
+def _cholesky_in_place(gram: Tensor, tracer: Tracer, kind: str) -> tuple[Tensor, Tensor]:
+    with _disable_current_modes():
+        factor, failed = torch.linalg.cholesky_ex(gram.detach())
+    found = tracer.cholesky(tracer.nodes(gram, kind).reshape(-1), gram.shape[-1], kind)
+    tracer.attach(factor, found[:-1].reshape(factor.shape))
+    return factor, tracer.attach(torch.empty_like(factor[..., 0, 0]), found[-1].reshape(failed.shape))
 
 
 def triangular(
@@ -56,10 +66,11 @@ def triangular(
     """T^-1 B: (..., M, M), (..., M, P); B T^-1 where not ``left``."""
     if not left:
         return triangular(matrix.mT, right.mT, upper=not upper, unitriangular=unitriangular).mT.clone()
-    if in_memory(matrix):  # an upper triangle from behind is a lower one
-        flipped = (part.flip(-2) if upper else part for part in (matrix.flip(-1) if upper else matrix, right))
-        solution = _rolled_triangular(*flipped, unitriangular=unitriangular)
-        return solution.flip(-2) if upper else solution
+    if in_memory(matrix) and (where := _of_one(matrix, right)) is not None:
+        if not upper:
+            return _triangular_in_place(matrix, right, unitriangular, *where)
+        flipped = matrix.flip(-1, -2), right.flip(-2)  # an upper triangle from behind is a lower one
+        return _triangular_in_place(*flipped, unitriangular, *where).flip(-2)
     size = matrix.shape[-1]
     found: dict[int, Tensor] = {}
     for i in reversed(range(size)) if upper else range(size):
@@ -68,6 +79,15 @@ def triangular(
             row = row - matrix[..., i, j, None] * known
         found[i] = row if unitriangular else row / matrix[..., i, i, None]
     return torch.stack([found[i] for i in range(size)], dim=-2)
+
+
+def _triangular_in_place(lower: Tensor, right: Tensor, unit: bool, tracer: Tracer, kind: str) -> Tensor:
+    with _disable_current_modes():
+        given = lower.detach(), right.detach()
+        known = torch.linalg.solve_triangular(*given, upper=False, unitriangular=unit).contiguous()
+    sides = [tracer.nodes(part, kind).reshape(part.shape[-2:]) for part in (lower, right)]
+    found = tracer.substitute(np.concatenate(sides, axis=1), kind, unit)
+    return tracer.attach(known, found.reshape(known.shape))
 
 
 def cholesky_solve(right: Tensor, factor: Tensor, upper: bool = False) -> Tensor:
@@ -172,8 +192,6 @@ def solve_again(
 
 def orthogonal(matrix: Tensor, mode: str = "reduced") -> tuple[Tensor, Tensor]:
     """Q and R of a square matrix by Householder's reflections."""
-    if in_memory(matrix):
-        return _rolled_orthogonal(matrix)
     size = matrix.shape[-1]
     rest = matrix
     q = torch.eye(size, dtype=matrix.dtype, device=matrix.device).expand_as(matrix)
@@ -229,90 +247,6 @@ def log_of_determinant(matrix: Tensor) -> Tensor:
     return torch.where(sign < 0, torch.nan, size)
 
 
-def _rolled_cholesky(gram: Tensor) -> tuple[Tensor, Tensor]:
-    """L with L L' = K, and 0 or, where a pivot is not positive, its place: (..., M, M), (...)."""
-    size = gram.shape[-1]
-    where = _of_one(gram)
-    if where is not None:
-        tracer, kind = where
-        with _disable_current_modes():
-            factor, failed = torch.linalg.cholesky_ex(gram.detach())
-        found = tracer.cholesky(tracer.nodes(gram, kind).reshape(-1), size, kind)
-        tracer.attach(factor, found[:-1].reshape(factor.shape))
-        place = tracer.attach(torch.empty_like(factor[..., 0, 0]), found[-1].reshape(failed.shape))
-        return factor, place.to(torch.int32)
-    place, zero = _places(gram), torch.zeros_like(gram[..., 0])
-
-    def eliminate(carry: tuple[Tensor, Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        rest, factor, done, failed = carry  # row i is row done + i, cyclically
-        pivot = rest[..., 0, 0]
-        failed = torch.where((failed == 0) & ~(pivot > 0), done + 1, failed)
-        open_ = place < size - done.unsqueeze(-1)
-        column = torch.where(open_, rest[..., 0] / pivot.sqrt().unsqueeze(-1), 0.0)
-        rest = rest - column.unsqueeze(-1) * column.unsqueeze(-2)
-        rest = torch.constant_pad_nd(rest[..., 1:, 1:], [0, 1, 0, 1])
-        factor = torch.cat((factor[..., 1:], column.unsqueeze(-1)), dim=-1)
-        return rest, torch.cat((factor[..., 1:, :], factor[..., :1, :]), dim=-2), done + 1, failed
-
-    start = gram.clone(), torch.zeros_like(gram), zero[..., 0], zero[..., 0].clone()
-    _, factor, _, failed = repeat(size, eliminate, start)
-    return factor, failed.to(torch.int32)
-
-
-def _rolled_triangular(lower: Tensor, right: Tensor, *, unitriangular: bool) -> Tensor:
-    """T^-1 B of a lower triangle: (..., M, M), (..., M, P)."""
-    size = lower.shape[-1]
-    where = _of_one(lower, right)
-    if where is not None:
-        tracer, kind = where
-        with _disable_current_modes():
-            given = lower.detach(), right.detach()
-            known = torch.linalg.solve_triangular(*given, upper=False, unitriangular=unitriangular)
-            known = known.contiguous()
-        sides = (tracer.nodes(part, kind).reshape(part.shape[-2:]) for part in (lower, right))
-        found = tracer.substitute(np.concatenate([*sides], axis=1), kind, unitriangular)
-        return tracer.attach(known, found.reshape(known.shape))
-    place, done = _places(lower), torch.zeros_like((lower[..., 0, :1] + right[..., 0, :1])[..., 0])
-    batch = done.shape
-
-    def substitute(carry: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-        matrix, rows, done = carry  # row i is row done + i, cyclically
-        found = rows[..., :1, :]
-        found = found if unitriangular else found / matrix[..., :1, :1]
-        open_ = (place < size - done.unsqueeze(-1)).unsqueeze(-1)
-        rows = torch.where(open_, rows - matrix[..., :1] * found, rows)
-        matrix = torch.cat((matrix[..., 1:, :], matrix[..., :1, :]), dim=-2)
-        matrix = torch.cat((matrix[..., 1:], matrix[..., :1]), dim=-1)
-        return matrix, torch.cat((rows[..., 1:, :], found), dim=-2), done + 1
-
-    start = lower.expand(*batch, size, size).clone(), right.expand(*batch, *right.shape[-2:]).clone(), done
-    solution: Tensor = repeat(size, substitute, start)[1]
-    return solution
-
-
-def _rolled_orthogonal(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """Q and R of a square matrix by Householder's reflections: (..., M, M), (..., M, M)."""
-    size, place = matrix.shape[-1], _places(matrix)
-
-    def reflect(carry: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-        rest, q, done = carry  # column i of the rest is column done + i, cyclically
-        here, open_ = place == done.unsqueeze(-1), place >= done.unsqueeze(-1)
-        column = torch.where(open_, rest[..., 0], 0.0)
-        length = column.square().sum(-1, keepdim=True).sqrt()
-        head = torch.where(column < 0, column - length, column + length)
-        vector = torch.where(here, head, column)
-        square = vector.square().sum(-1, keepdim=True)
-        scaled = torch.where(square > 0, 2 / torch.where(square > 0, square, 1.0), 0.0) * vector
-        rest = rest - scaled.unsqueeze(-1) * (vector.unsqueeze(-1) * rest).sum(-2, keepdim=True)
-        q = q - (q * vector.unsqueeze(-2)).sum(-1, keepdim=True) * scaled.unsqueeze(-2)
-        return torch.cat((rest[..., 1:], rest[..., :1]), dim=-1), q, done + 1
-
-    identity = torch.eye(size, dtype=matrix.dtype, device=matrix.device).expand_as(matrix)
-    start = matrix.clone(), identity.clone(), torch.zeros_like(matrix[..., 0, 0])
-    rest, q, _ = repeat(size - 1, reflect, start)
-    return q, torch.cat((rest[..., 1:], rest[..., :1]), dim=-1).triu()
-
-
 def _of_one(*matrices: Tensor) -> tuple[Tracer, str] | None:
     """Return the tracer of single matrices that an operation in place serves, and the type of its numbers."""
     tracer = next(filter(None, map(tracer_of, matrices)), None)
@@ -321,10 +255,6 @@ def _of_one(*matrices: Tensor) -> tuple[Tracer, str] | None:
         return None
     kinds = {tracer.kind(matrix.dtype) for matrix in matrices}
     return (tracer, kinds.pop()) if kinds in ({REAL}, {WIDE}) else None
-
-
-def _places(matrix: Tensor) -> Tensor:
-    return torch.arange(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
 
 
 def eigen(gram: Tensor, UPLO: str = "L", compute_v: bool = True) -> tuple[Tensor, Tensor]:

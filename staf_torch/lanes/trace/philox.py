@@ -102,7 +102,9 @@ def _by_numpy(seed: Tensor, step: Tensor, count: int) -> Tensor:
     counter = at[..., None], block, np.zeros_like(block), np.zeros_like(block)
     found = np.stack(_mixed(counter, key, _unsigned_product), axis=-1)
     whole = (found[..., ::2] << np.uint64(21)) + (found[..., 1::2] >> np.uint64(11))
-    return (_signed(whole) - 2**52).flatten(-2)[..., :count].to(step.dtype) * 2.0**-52
+    return (torch.from_numpy(whole.astype(np.int64)) - 2**52).flatten(-2)[..., :count].to(
+        step.dtype
+    ) * 2.0**-52
 
 
 def _numbers(halves: Sequence[Tensor], block: Tensor, second: bool) -> Tensor:
@@ -114,16 +116,8 @@ def _numbers(halves: Sequence[Tensor], block: Tensor, second: bool) -> Tensor:
     )
     none = torch.zeros_like(place)
     counter, chosen = (step, place, none, none), slice(2 * second, 2 * second + 2)
-    if type(low) is Tensor and low.is_cpu and low.dim():  # a plain loop of few rows draws at every step
-        at, by = ([part.numpy().astype(np.uint64) for part in parts] for parts in (counter, key))
-        one, other = map(_signed, _mixed(at, by, _unsigned_product)[chosen])
-    else:
-        one, other = words(counter, key)[chosen]
+    one, other = words(counter, key)[chosen]
     return ((one << 21) + (other >> 11) - 2**52).to(low.dtype) * 2.0**-52
-
-
-def _signed(word: Any) -> Tensor:
-    return torch.from_numpy(word.astype(np.int64))
 
 
 _LIBRARY = torch.library.Library("staf_torch", "FRAGMENT")

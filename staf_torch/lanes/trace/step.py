@@ -21,13 +21,11 @@ from ..row_numbers import RowNumbers, made_of_list, resolving
 from ..tree import Shared, Tree, flatten, plain
 from . import factorisations
 from .captured_tensors import Recipe, tensors
-from .decompositions import CHOICES, MOVEMENTS, REPLACEMENTS, added_at, many, moved, of_torch
+from .decompositions import MOVEMENTS, REPLACEMENTS, choice, moved, of_torch
 from .graph import NOW, STEP, Graph, Sizes
 from .loops import tracing
 from .rules import RULES
 from .tracer import NotLoweredError, Tracer
-
-RULES["scatter_add"] = added_at
 
 
 def lower(t: Tracer, func: Any, name: str, out: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
@@ -38,19 +36,13 @@ def lower(t: Tracer, func: Any, name: str, out: Any, args: Sequence[Any], kwargs
     """
     # What torch's own decompositions end in takes the arguments of the operation of the same name.
     plain = name if name in REPLACEMENTS else name.removeprefix("prims::")
-    rule = RULES.get(plain)
-    rolled = (
-        len(args) > 2
-        and "reduce" not in kwargs
-        and many(name, *args[:3])
-        and (t.traced(args[2]) or not t.stated(args[2]))
-    )
-    if rule is not None and not rolled:
-        return rule(t, out, *args, **kwargs)
-    if name in MOVEMENTS and not rolled:
-        return moved(t, func, out, args, kwargs)
-    tables: Any = (CHOICES,) if rolled else (FACTORISATIONS, REPLACEMENTS)
-    decomposition = next((table[name] for table in tables if name in table), of_torch(func, args))
+    if (chosen := choice(t, func, name, args, kwargs)) is None:
+        if (rule := RULES.get(plain)) is not None:
+            return rule(t, out, *args, **kwargs)
+        if name in MOVEMENTS:
+            return moved(t, func, out, args, kwargs)
+    tables: Any = (FACTORISATIONS, REPLACEMENTS)
+    decomposition = chosen or next((table[name] for table in tables if name in table), of_torch(func, args))
     if name == "linalg_lu_solve" and any(
         t.graph.value(node) != -1 for node in t.nodes(args[1]).ravel().tolist()
     ):

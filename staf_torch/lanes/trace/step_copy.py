@@ -9,9 +9,8 @@ from .tracer import NotLoweredError
 
 _MOST = 40_000  # nodes of a program whose loops are written out
 _COSTLY, _WORTH = 20, 3  # operations that a function takes, and that a number written and read is worth
-_FUNCTIONS = frozenset(
-    ("exp", "expm1", "log", "log1p", "sin", "cos", "tan", "tanh", "atan2", "pow", "sqrt", "div")
-)
+_COMPUTED = "exp expm1 log log1p sin cos tan tanh atan2 pow sqrt div"
+_FUNCTIONS = frozenset(_COMPUTED.split())
 _ARRAYS = ("map", "dot")
 _KEPT = _FUNCTIONS.union(_ARRAYS, ("add", "sub", "mul", "neg", "abs", "where", "min", "max"))
 
