@@ -3,8 +3,8 @@
 LAPACK exchanges rows where a pivot asks for it. Rows in lanes have pivots of their own, so nothing may
 branch on one: a row is chosen by comparing and selecting, and places are compared in place of exchanged. Up
 to `LARGE` entries an elimination is written out and lives in registers; above, Cholesky's and the one under
-a triangle are an operation of a program, in place. A solution by rows is a loop, in which a matrix moves on by
-a column after each pass, so that the text knows the first pivot alone. Eliminations by columns: Golub and
+a triangle are an operation of a program, in place. A solution by rows is a loop, in which a matrix moves on
+by a column after each pass, so that the text knows the first pivot alone. Eliminations by columns: Golub and
 Van Loan, Matrix Computations, ch. 3 to 5.
 
 Eigenvalues with vectors: Jacobi's rotations, M/2 disjoint pairs a pass (Brent and Luk, 1985), a fixed

@@ -8,7 +8,6 @@ moving the inputs by a few units in the last place. No code is read: what a func
 
 from __future__ import annotations
 
-import math
 import random
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -17,7 +16,6 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.overrides import TorchFunctionMode
 
 from ..calls.choice import RepaysError
 from ..calls.inputs import Given
@@ -28,12 +26,12 @@ from .loops import few_passes
 _BITS = (1, -1, 3, -5, 17)  # units in the last place by which inputs are moved
 _NEARBY = (0.1, 1e-3)  # of an input and of 1: points beside those that are given
 _CLOSE = 1e-2  # of the largest entry: far above what another order of sums does to an ill-conditioned row
-_SUMMED = 1e3  # roundings of the largest product in a sum, by which another order may change it
-_PRODUCTS = frozenset(("matmul", "__matmul__", "__rmatmul__", "mm", "bmm", "mv", "dot", "inner", "linear",
-                       "einsum", "tensordot", "vecdot", "addmm", "addmv", "baddbmm"))  # fmt: skip
+_ZERO = 1e-4  # of the largest number, or of 1: above what is left where large products cancel
+
+Step = Callable[..., Any]
 
 
-def doubt(step: Callable[..., Any], given: Given, *, again: bool = True) -> str | None:
+def doubt(step: Step, given: Given, *, again: bool = True) -> str | None:
     """Return why a step must not be written down with a single row, None where it may.
 
     It is called with one row, ``again`` unless it has been, and with that row beside the one that differs
@@ -45,7 +43,7 @@ def doubt(step: Callable[..., Any], given: Given, *, again: bool = True) -> str 
         alone = _called(step, given, [first])
         if again:  # the same operations in the same order
             repeated = _called(step, given, [first])
-            if len(alone) != len(repeated) or not all(map(_leaves_are_close, alone, repeated)):
+            if len(alone) != len(repeated) or not all(map(_are_close, alone, repeated)):
                 return "gives other numbers when it is called again (random numbers, a counter, a clock?)"
         if given.rows == 1:
             return None
@@ -55,20 +53,22 @@ def doubt(step: Callable[..., Any], given: Given, *, again: bool = True) -> str 
             raise
         except Exception as error:  # which plain torch will raise again, for all rows
             return f"takes one row but not two: {type(error).__name__}: {error}"
-        for row, at in ((first, 0), (other, 1)):
+        for at, row in enumerate((first, other)):
             found = alone if row == first else _called(step, given, [row])
             beside = [leaf[at : at + 1] for leaf in both]
+            if len(found) != len(beside):
+                return _MIXED
             differ = _differing(step, given, row, found, beside)
             if differ and not _cancelled(step, given, [first, other], at, differ, found, beside):
-                return (
-                    "gives a row other numbers beside another row "
-                    "(a mean over the batch, a branch on its size?)"
-                )
+                return _MIXED
     return None
 
 
+_MIXED = "gives a row other numbers beside another row (a mean over the batch, a branch on its size?)"
+
+
 def _differing(
-    step: Callable[..., Any], given: Given, row: int, alone: Sequence[Tensor], beside: Sequence[Tensor]
+    step: Step, given: Given, row: int, alone: Sequence[Tensor], beside: Sequence[Tensor]
 ) -> list[int]:
     """Return which leaves of a row alone are not those beside another, as far as rounding lets them mean
     anything.
@@ -76,21 +76,16 @@ def _differing(
     One row and two are not summed in the same order. What then changes by more than a hundredth, a matrix
     that is singular to rounding, changes with the last bits of the inputs, too, and says nothing.
     """
-    if len(alone) != len(beside):
-        return [*range(max(len(alone), len(beside)))]
-    differ = [
-        k for k, pair in enumerate(zip(alone, beside, strict=True)) if not _leaves_are_close(*pair, _CLOSE)
-    ]
+    differ = [k for k, pair in enumerate(zip(alone, beside, strict=True)) if not _are_close(*pair, _CLOSE)]
     for bits in _BITS:
-        if not differ:
-            break
-        moved = _called(step, given, [row], bits)
-        differ = [k for k in differ if _leaves_are_close(alone[k], moved[k], _CLOSE)]
+        if differ:
+            moved = _called(step, given, [row], bits)
+            differ = [k for k in differ if _are_close(alone[k], moved[k], _CLOSE)]
     return differ
 
 
 def _cancelled(
-    step: Callable[..., Any],
+    step: Step,
     given: Given,
     rows: Sequence[int],
     at: int,
@@ -101,19 +96,13 @@ def _cancelled(
     """Return whether leaves of a row differ as they are zero but for rounding, which no last bit of a zero
     moves: a variance at a point that is known.
 
-    They differ by less than half the digits of what the step computes with, or by few roundings of what a
-    product of matrices sums up, and not at all at points nearby. What looks at other rows does so there, too.
+    They differ by little, and not at all at points nearby. What looks at other rows does so there, too.
     """
-    if len(alone) != len(beside):
-        return False
-    with _Largest() as seen:
-        _called(step, given, [rows[at]])
     for k in differ:
         if alone[k].shape != beside[k].shape or not alone[k].is_floating_point():
             return False
-        change = float((alone[k] - beside[k]).abs().nan_to_num(0.0).max())
-        eps = torch.finfo(alone[k].dtype).eps
-        if change > max(eps**0.5 * seen.size, _SUMMED * eps * seen.summed):
+        size = max(1.0, float(alone[k].abs().nan_to_num(0.0).max()))
+        if float((alone[k] - beside[k]).abs().nan_to_num(0.0).max()) > _ZERO * size:
             return False
     rest = [*differ]
     for share in _NEARBY:
@@ -124,40 +113,10 @@ def _cancelled(
             raise
         except Exception:  # the step takes no such inputs
             continue
-        pairs = {k: (one[k], both[k]) for k in rest if len(one) == len(both) == len(alone)}
-        near = {
-            k for k, pair in pairs.items() if _leaves_are_close(*pair, _CLOSE) and pair[0].isfinite().any()
-        }
-        rest = [k for k in rest if k not in near]
+        if len(one) == len(both) == len(alone):
+            near = [k for k in rest if one[k].isfinite().any() and _are_close(one[k], both[k], _CLOSE)]
+            rest = [k for k in rest if k not in near]
     return not rest
-
-
-class _Largest(TorchFunctionMode):
-    """Context: the sizes of the largest number that torch computes inside of it, and of the largest product
-    that it sums up in one operation, a matrix' by a vector's, of which only the sum is seen."""
-
-    size = 0.0
-    summed = 0.0
-
-    def __torch_function__(
-        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
-    ) -> Any:
-        out = func(*args, **(kwargs or {}))
-        self.size = max(self.size, *map(_largest, out if type(out) in (tuple, list) else (out,)), 0.0)
-        if getattr(func, "__name__", "") in _PRODUCTS:
-            factors = [part for arg in args for part in (arg if type(arg) in (tuple, list) else (arg,))]
-            self.summed = max(self.summed, math.prod(map(_largest, factors[-2:])))
-        return out
-
-
-def _largest(part: Any) -> float:
-    """Return the size of the largest number of a tensor, 0 of anything else."""
-    while isinstance(part, Tensor) and torch._C._functorch.is_functorch_wrapped_tensor(part):
-        part = torch._C._functorch.get_unwrapped(part)
-    if not (isinstance(part, Tensor) and part.is_floating_point() and part.numel()):
-        return 0.0
-    with torch._C.DisableTorchFunction():
-        return float(part.detach().abs().nan_to_num(0.0, 0.0, 0.0).max())
 
 
 @contextmanager
@@ -197,9 +156,7 @@ def _farthest(given: Given) -> int:
     return int(distance.argmax()) if given.rows > 1 else 0
 
 
-def _called(
-    step: Callable[..., Any], given: Given, rows: Sequence[int], bits: int = 0, share: float = 0.0
-) -> list[Tensor]:
+def _called(step: Step, given: Given, rows: Sequence[int], bits: int = 0, share: float = 0.0) -> list[Tensor]:
     """All leaves of what a step makes of some rows at the first time; the inputs are copies.
 
     ``bits`` are units in the last place by which all numbers are moved, ``share`` is of their size and of 1.
@@ -232,7 +189,7 @@ def _called(
         return flatten(over_rows(plainly, carry, now, row))[0]
 
 
-def _leaves_are_close(found: Tensor, other: Tensor, tolerance: float = 0.0) -> bool:
+def _are_close(found: Tensor, other: Tensor, tolerance: float = 0.0) -> bool:
     if found.shape != other.shape:
         return False
     one, two = found.double(), other.double()
