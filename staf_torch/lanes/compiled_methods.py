@@ -19,7 +19,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from types import CodeType, MethodType
-from typing import Any, Protocol, overload
+from typing import Any, overload
 
 import torch
 from torch import Tensor, nn
@@ -45,17 +45,6 @@ _KEPT = 64  # shapes of calls that are remembered
 _is_exporting = getattr(torch.compiler, "is_exporting", torch.compiler.is_compiling)  # torch 2.6 has none
 
 
-class Served(Protocol):
-    """The callable in the place of a method: (n,) or (B, n) to (B, 1, m), or trees of (B, ...) to such."""
-
-    at_once: dict[Any, Callable[[Tensor], Tensor]]
-
-    @property
-    def compiled(self) -> bool: ...
-
-    def __call__(self, *given: Tree) -> Any: ...
-
-
 class compiled:  # noqa: N801
     """Decorator of a method whose rows are alone, y = f(x) or trees of several: compiled where that pays.
 
@@ -73,13 +62,13 @@ class compiled:  # noqa: N801
 
     Args:
         name: in the log; programs of one name share texts.
-        by: makes what serves for an owner; one program of the method by default.
+        by: makes what serves for an owner, the like of `Rows`; one program of the method by default.
         pays: calls of a small batch after which it is compiled at the latest; inf: not before `hasten`.
         copies: as in `Program`.
     """
 
     def __init__(
-        self, name: str, *, by: Callable[[Any], Served] | None = None, pays: float = _PAYS, copies: int = 1
+        self, name: str, *, by: Callable[[Any], Any] | None = None, pays: float = _PAYS, copies: int = 1
     ) -> None:
         self.name, self.by, self.pays, self.copies = name, by, pays, copies
 
@@ -146,7 +135,7 @@ class CompiledMethod:
         self._plain: tuple[PlainTime, float] | None = None  # of its first call, with so many rows
         self._lock = Mutex()
         self._at_once: dict[Any, Callable[[Tensor], Tensor]] = {}  # by shape, strides, dtype: of what serves
-        self._served: Served | None = None  # written before what it has read
+        self._served: Any = None  # written before what it has read
         self._read: Contents | None = None
 
     @overload
@@ -298,7 +287,7 @@ class CompiledMethod:
                 return self._read  # another thread has
             settings, read = self._settings, Contents(self.definition, self.owner)
             read.warn(settings.name)
-            served: Served | None = None
+            served: Any = None
             if settings.by is None:
                 made = self.definition, settings.name, self.definition, self.owner
                 rows = Rows(*made, copies=settings.copies, make=lambda definition, _: definition)

@@ -307,22 +307,10 @@ def backward(
     if not pairs:
         return tuple(map(torch.zeros_like, at))
     some, their = [end for end, _ in pairs], [slope for _, slope in pairs]
-    found = _passed(some, their, at, slopes is not None, create_graph)
-    return tuple(torch.zeros_like(x) if s is None else s for s, x in zip(found, at, strict=True))
-
-
-def _passed(
-    ends: Sequence[Tensor],
-    slopes: Sequence[Tensor | None],
-    at: Sequence[Tensor],
-    again: bool,
-    create_graph: bool,
-) -> Sequence[Tensor | None]:
     run = getattr(torch.autograd.graph, "_engine_run_backward", None)
-    if slopes[0] is None or run is None or torch._C._len_torch_function_stack():
-        return torch.autograd.grad(
-            ends, at, slopes, retain_graph=again, create_graph=create_graph, allow_unused=True
-        )
-    given = tuple(ends), tuple(slopes), again, create_graph, tuple(at), True
-    found: Sequence[Tensor | None] = run(*given, accumulate_grad=False)
-    return found
+    if slopes is None or run is None or torch._C._len_torch_function_stack():
+        options: dict[str, Any] = {"retain_graph": slopes is not None, "create_graph": create_graph}
+        found = torch.autograd.grad(some, at, their, allow_unused=True, **options)
+    else:
+        found = run(tuple(some), tuple(their), True, create_graph, tuple(at), True, accumulate_grad=False)
+    return tuple(torch.zeros_like(x) if s is None else s for s, x in zip(found, at, strict=True))

@@ -12,7 +12,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -29,9 +29,6 @@ from ..trace.tracer import NotLoweredError
 from ..tree import Shared, Tree, flatten, plain, unflatten
 from .carries import parts
 from .reverse import Reverse
-
-if TYPE_CHECKING:
-    from .steps import Differentiated
 
 
 class Differentiated(NamedTuple):

@@ -189,5 +189,5 @@ def say(name: str, reason: str, kind: str | None = None) -> None:
 
 def say_transformed(name: str) -> None:
     """Log once that a transform keeps a program in plain torch, where one looks and nobody traces."""
-    if inputs.transformed() and not inputs.traced():
+    if inputs.transformed() and not torch._C._len_torch_dispatch_stack():
         say(name, "a transform of `torch.func` (vmap, jacrev, grad, ...) or forward mode is active")

@@ -56,13 +56,14 @@ def ordinary(leaves: Sequence[Any], *, recorded: bool | None = None) -> Where:
     if seen_by_others():
         return False
     recorded = torch.is_grad_enabled() if recorded is None else recorded
-    for leaf in leaves:
-        tensor = leaf.tensor if type(leaf) is Shared else leaf
-        if not readable(tensor, recorded):
-            return False
-        if not tensor.is_cpu:
-            return _one_device(leaves, recorded)
-    return processor
+    tensors = [leaf.tensor if type(leaf) is Shared else leaf for leaf in leaves]
+    if not all(readable(x, recorded) for x in tensors):
+        return False
+    if all(x.is_cpu for x in tensors):
+        return processor
+    places = {x.device for x in tensors if x.dim() or not x.is_cpu}  # single numbers aside
+    where = places.pop()
+    return where if not places and where.type == "cuda" else False
 
 
 def served(leaves: Sequence[Any]) -> Where:
@@ -70,33 +71,14 @@ def served(leaves: Sequence[Any]) -> Where:
     return ordinary(leaves, recorded=False)
 
 
-def _one_device(leaves: Sequence[Any], recorded: bool) -> Where:
-    """Return the CUDA device where plain tensors are, single numbers aside; False where there is none."""
-    found = set[torch.device]()
-    for leaf in leaves:
-        tensor = plain(leaf)
-        if not readable(tensor, recorded):
-            return False
-        if tensor.dim() or not tensor.is_cpu:
-            found.add(tensor.device)
-    where = found.pop()
-    return where if not found and where.type == "cuda" else False
-
-
 def seen_by_others() -> bool:
     """Return whether a tracer, a transform of torch.func or forward mode looks at the operations."""
-    looks = _transforms() is not None or forward_ad._current_level >= 0 or _modes() > 0
-    return looks or _tracing() is not None
+    return transformed() or _modes() > 0 or _tracing() is not None
 
 
 def transformed() -> bool:
     """Return whether a transform of torch.func or forward mode looks at the operations."""
     return _transforms() is not None or forward_ad._current_level >= 0
-
-
-def traced() -> bool:
-    """Return whether a tracer or another mode looks at the operations."""
-    return _modes() > 0
 
 
 _TENSORS = (Tensor, torch.nn.Parameter)

@@ -1,18 +1,17 @@
 """Kernels of a program, and prepared calls of them: what `planned_call.PlannedCall` is for the processor.
 
-Histories for which a device has no room: a call in chunks of times, each brought to the processor.
-
-The carry stays on the device and goes from one chunk to the next, so that the bits are those of one call.
+A history for which a device has no room is computed in chunks of times, each brought to the processor.
 """
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
 import logging
 import math
 import struct
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -46,13 +45,9 @@ class DeviceCall:
 
     Args:
         compiled: the program, whose call is the text of its kernel.
-        leaves: examples of the inputs: what a row has once, what times bring, the carry.
-        times: for each of them, whether a dimension of times comes first (after the rows).
-        rows, steps, every: of the call.
-        once: how many of the leaves a row has once.
+        leaves, times, rows, steps, every, once, backwards: as of `PlannedCall`.
         where: the device.
-        whole: whether results must be there; else what does not fit comes to the processor (`in_chunks`).
-        backwards: whether inputs of times are read from the last to the first.
+        whole: whether results must be there; else what does not fit comes to the processor.
 
     Attributes:
         structure: of the outputs.
@@ -102,7 +97,8 @@ class DeviceCall:
         reach = max([abs(entry) * entries for *_, entry, entries in read], default=0)
         wide = max(rows * (recorded + 1) * most, reach) > _MOST
         unit = all(entry == 1 or entries == 1 for *_, entry, entries in read)
-        self._device, self._all = device(where), [room for room in self._rooms if room is not None]
+        self._device: Any = device(where)
+        self._all = [room for room in self._rooms if room is not None]
         self._bytes = sum(room.bytes for room in self._rooms if room is not None)
         table, room = compiled.table, self._device.arguments() - _OTHERS
         near = in_arguments(table.numel(), table.dtype == torch.float32)
@@ -171,37 +167,56 @@ class DeviceCall:
     def _in_chunks(self, leaves: Sequence[Any]) -> list[Tensor]:
         """Run in chunks of times, the outputs on the processor.
 
+        The carry stays on the device and goes from one chunk to the next, so that the bits are those of one
+        call.
+
         Raises:
-            torch.OutOfMemoryError: if that cannot be.
+            torch.OutOfMemoryError: where a single time does not fit, or the processor has no memory for the
+                outputs.
         """
-        made: dict[Any, DeviceCall] = {}
-        sizes: dict[str, Any] = {"rows": self._rows, "every": self._every, "once": self._once}
-
-        def some(given: Sequence[Any], steps: int) -> list[Tensor]:
-            form = steps, *(plain(leaf).stride() for leaf in given)
-            if form not in made:
-                sizes.update(steps=steps, where=self._where, whole=True)
-                made[form] = DeviceCall(self._compiled, given, self._timed, **sizes)
-            return made[form](given)
-
-        found = None
-        if not (self._whole or capturing(self._compiled.table.new_empty(0, device=self._where))):
-            more: dict[str, Any] = {"free": self._device.free(), "where": self._where}
-            more |= {"carries": len(self._compiled.carry), "steps": self._steps, "every": self._every}
-            found = in_chunks(some, leaves, self._timed, self._all, **more)
-        if found is None:
-            raise torch.OutOfMemoryError(self._too_large())
-        return found
-
-    def _too_large(self) -> str:
-        """Tell what to do where results find no room."""
-        times = -(-self._steps // self._every)
-        return (
-            f"The results of this call take {self._bytes / 1e9:.3g} GB on {self._where}, for {self._rows} "
-            f"rows and {times} recorded times; there is no room for them, nor in the processor's memory. "
-            "Record fewer times (`every=`), leave the history out (`history=False`) where that is "
-            "offered, or call for fewer rows or times in turn."
-        )
+        carries, every, where = len(self._compiled.carry), self._every, self._where
+        outputs = self._all[carries:]
+        size, recorded = sum(room.bytes for room in outputs), max(1, -(-self._steps // every))
+        whole, count = list[Tensor](), 0
+        if size and not (self._whole or capturing(self._compiled.table.new_empty(0, device=where))):
+            left = _SHARE * self._device.free() - 2 * sum(room.bytes for room in self._all[:carries])
+            count = int(left * recorded / size)
+        if count > 0 and size <= _available():
+            with contextlib.suppress(RuntimeError):
+                whole = [torch.empty_strided(*room[:2], dtype=room.dtype, device="cpu") for room in outputs]
+        if not whole:
+            raise torch.OutOfMemoryError(
+                f"The results of this call take {self._bytes / 1e9:.3g} GB on {where}, for {self._rows} "
+                f"rows and {recorded} recorded times; there is no room for them, nor in the processor's "
+                "memory. Record fewer times (`every=`), leave the history out (`history=False`) where that "
+                "is offered, or call for fewer rows or times in turn."
+            )
+        length, chunks = min(count, recorded) * every, -(-recorded // count)
+        if where not in _said:
+            _said.add(where)
+            _log.warning(
+                "a history of %.3g GB has no room on %s: it is on the processor, brought there in %d chunks",
+                *(size / _GIGA, where, chunks),
+            )
+        given, names, made = [*leaves], len(leaves) - carries, dict[Any, DeviceCall]()
+        sizes: dict[str, Any] = {"rows": self._rows, "every": every, "once": self._once, "where": where}
+        with Sign("chunks of times", chunks) as sign:
+            for start in range(0, self._steps, length):
+                stop = min(start + length, self._steps)
+                for k, (leaf, timed) in enumerate(zip(leaves, self._timed, strict=True)):
+                    if timed:
+                        given[k] = _cut(leaf, start, stop)
+                form = stop - start, *(plain(leaf).stride() for leaf in given)
+                if form not in made:
+                    made[form] = DeviceCall(
+                        self._compiled, given, self._timed, steps=stop - start, whole=True, **sizes
+                    )
+                found = made[form](given)
+                given[names:] = found[:carries]
+                for target, part in zip(whole, found[carries:], strict=True):
+                    target[:, start // every :][:, : part.shape[1]].copy_(part)
+                sign.advance()
+        return [*given[names:], *whole]
 
     def leave_out(self, ends: Collection[int]) -> None:
         """Write nothing of these of the carry: None is in their place from now on."""
@@ -237,55 +252,6 @@ class Room(NamedTuple):
     def bytes(self) -> int:
         """Bytes that it takes."""
         return math.prod(self.shape) * self.dtype.itemsize
-
-
-def in_chunks(
-    call: Callable[[Sequence[Any], int], Sequence[Tensor]],
-    leaves: Sequence[Any],
-    times: Sequence[bool],
-    rooms: Sequence[Room],
-    *,
-    carries: int,
-    steps: int,
-    every: int,
-    free: int,
-    where: torch.device,
-) -> list[Tensor] | None:
-    """Return the carry after the last step, on the device, and the outputs, on the processor.
-
-    ``leaves`` are the inputs, the carry last, ``rooms`` those of all results, the carry first. None where a
-    single time does not fit, or the processor has no memory for the outputs.
-    """
-    outputs = rooms[carries:]
-    size, recorded = sum(room.bytes for room in outputs), max(1, -(-steps // every))
-    left = _SHARE * free - 2 * sum(room.bytes for room in rooms[:carries])
-    count = int(left * recorded / size) if size else 0
-    if count < 1 or size > _available():
-        return None
-    try:
-        whole = [torch.empty_strided(*room[:2], dtype=room.dtype, device="cpu") for room in outputs]
-    except RuntimeError:
-        return None
-    length, chunks = min(count, recorded) * every, -(-recorded // count)
-    if where not in _said:
-        _said.add(where)
-        _log.warning(
-            "a history of %.3g GB has no room on %s: it is on the processor, brought there in %d chunks",
-            *(size / _GIGA, where, chunks),
-        )
-    given, names = [*leaves], len(leaves) - carries
-    with Sign("chunks of times", chunks) as sign:
-        for start in range(0, steps, length):
-            stop = min(start + length, steps)
-            for k, (leaf, timed) in enumerate(zip(leaves, times, strict=True)):
-                if timed:
-                    given[k] = _cut(leaf, start, stop)
-            found = call(given, stop - start)
-            given[names:] = found[:carries]
-            for target, part in zip(whole, found[carries:], strict=True):
-                target[:, start // every :][:, : part.shape[1]].copy_(part)
-            sign.advance()
-    return [*given[names:], *whole]
 
 
 def _cut(leaf: Any, start: int, stop: int) -> Any:

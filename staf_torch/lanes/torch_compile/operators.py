@@ -220,18 +220,18 @@ class GraphCall:
         return [*ends, _Ticket(results, inputs, self._surroundings).token()]
 
 
-class _Ticket:
-    """Results that autograd has recorded, and the inputs by which a gradient is wanted."""
+class _Ticket(bytearray):
+    """Results that autograd has recorded, and the inputs by which a gradient is wanted: memory of a token."""
 
     def __init__(self, results: Sequence[Tensor], inputs: Sequence[Tensor], at: Surroundings) -> None:
-        self.results, self.inputs, self.surroundings, self.number = results, inputs, at, next(_count)
-        _tickets[self.number] = self
+        number = next(_count)
+        super().__init__(number.to_bytes(8, "little"))
+        self.results, self.inputs, self.surroundings = results, inputs, at
+        _tickets[number] = self
 
     def token(self) -> Tensor:
-        """Return the number, in memory that keeps the ticket."""
-        memory = _TicketMemory(self.number.to_bytes(8, "little"))
-        memory.ticket = self
-        return torch.frombuffer(memory, dtype=torch.int64).view(())
+        """Return its number, in memory that keeps the ticket."""
+        return torch.frombuffer(self, dtype=torch.int64).view(())
 
     def gradients(self, slopes: Sequence[Tensor], places: Sequence[int]) -> list[Tensor]:
         """Return the gradients by all inputs, of slopes by the results at some places."""
@@ -244,12 +244,6 @@ class _Ticket:
                 found = torch.autograd.grad(ends, self.inputs, by, retain_graph=True, allow_unused=True)
         made = [torch.zeros_like(x) if y is None else y for x, y in zip(self.inputs, found, strict=True)]
         return _apart(made, [TensorForm.of(x).dense() for x in self.inputs], slopes)
-
-
-class _TicketMemory(bytearray):
-    """The memory of a token."""
-
-    ticket: _Ticket
 
 
 class Surroundings:
