@@ -73,7 +73,8 @@ def served(leaves: Sequence[Any]) -> Where:
 
 def seen_by_others() -> bool:
     """Return whether a tracer, a transform of torch.func or forward mode looks at the operations."""
-    return transformed() or _modes() > 0 or _tracing() is not None
+    looks = _transforms() is not None or forward_ad._current_level >= 0 or _modes() > 0
+    return looks or _tracing() is not None
 
 
 def transformed() -> bool:
