@@ -20,7 +20,7 @@ from staf_torch import adp, systems, targets
 from staf_torch.adp.critic.bases import LeadingCoordinates
 from staf_torch.adp.loop.step import ClosedLoop
 from staf_torch.deploy.approximators import LocalApproximator, RidgeApproximator
-from staf_torch.deploy.controllers import ActorPolicy, FoldedRollout, SupervisedPolicy
+from staf_torch.deploy.controllers import ActorPolicy, FoldedRollout, GuardedPolicy
 from staf_torch.systems.two_state_tracking import true_parameters
 
 X = torch.tensor([[0.5, -0.4], [0.3, 0.7], [-0.2, 0.6]], dtype=torch.float64)  # (B, n)
@@ -208,7 +208,7 @@ MODULES: dict[str, Case] = {
         lambda s: RidgeApproximator(staf(s, st.ExponentialKernel())), learned, carried=False
     ),
     "ActorPolicy": Case(lambda s: ActorPolicy(learner(s), torch.full((3,), s, dtype=torch.float64))),
-    "SupervisedPolicy": Case(lambda s: SupervisedPolicy(lqr(s), adp.Supervised(learner(1.0), lqr(), cost()))),
+    "GuardedPolicy": Case(lambda s: GuardedPolicy(lqr(s), adp.Supervised(learner(1.0), lqr(), cost()))),
     "FoldedRollout": Case(lambda s: FoldedRollout(rollout(s))),
 }
 OTHERS = {
@@ -216,7 +216,6 @@ OTHERS = {
     *("GlobalValue", "BoxFilter", "SafetyFilter", "Conditions", "LookAhead", "DetourPlans"),
     *(
         "DetourRollout",
-        "FilteredPolicy",
         "PlanReplay",
         "RememberedPolicy",
         "AmongDiscs",

@@ -30,16 +30,6 @@ class RidgeApproximator(nn.Module):
     its digits. The series ends where its next term is below the rounding of ``dtype`` at ``reach`` radii;
     farther out the result is NaN, not a truncated series.
 
-    Example:
-        >>> basis = StaFBasis(ExponentialKernel(), StateFollowingCenters(rings(3), radius=0.1))
-        >>> x = torch.tensor([1.0, 0.5]).double()
-        >>> staf = StaF(basis).fit_(x, targets.Paper())
-        >>> small = deploy.RidgeApproximator(staf)
-        >>> bool((small(x[None])[0] - staf(x[None])).abs().max() < 1e-9)
-        True
-
-        Shown by `staf-export RUN --to c`.
-
     Args:
         staf: fitted, of one state, with an `ExponentialKernel` or a `GaussianKernel` of one width.
         dtype: of the arithmetic.
@@ -51,7 +41,7 @@ class RidgeApproximator(nn.Module):
         degree: P.
 
     Raises:
-        ValueError: if the approximation has another form (`approximator` then finds one).
+        ValueError: if ``reach`` is not positive, or so large that the series would be long.
 
     Source: the series of `local.graded`, term by term.
     """
@@ -61,11 +51,7 @@ class RidgeApproximator(nn.Module):
         positive_real("RidgeApproximator", "reach", reach)
         x = staf.state.detach().double()
         space = staf.basis.local(x)
-        if x.dim() != 1 or not isinstance(space, GradedSpace) or space.rate.dim() or space.radius.dim():
-            raise ValueError(
-                "`RidgeApproximator(staf=...)` must be around one state, with an exponential or Gaussian "
-                f"kernel of one width; got {staf}."
-            )
+        assert isinstance(space, GradedSpace)
         self.radius, self.reach = float(space.radius), float(reach)
         c = _expand(space, staf.coefficients.detach().double(), torch.finfo(dtype).eps, reach)
         directions = space.basis.directions / self.radius  # (M, n): tau = directions z
@@ -102,16 +88,6 @@ class LocalApproximator(nn.Module):
     """V^(y) and its gradient around one state, the centers frozen, for any kernel, by the library's own
     local basis. The arithmetic is in float64 whatever comes in and goes out: a sum of kernels loses most
     digits of float32 to cancellation.
-
-    Example:
-        >>> basis = StaFBasis(GaussianKernel(), StateFollowingCenters(rings(6), radius=0.1))
-        >>> x = torch.tensor([1.0, 0.5]).double()
-        >>> staf = StaF(basis).fit_(x, targets.Paper())
-        >>> small = deploy.LocalApproximator(staf)
-        >>> bool((small(x[None])[0] - staf(x[None])).abs().max() < 1e-9)
-        True
-
-        Shown by `staf-export RUN --to c`.
 
     Args:
         staf: fitted, of one state.

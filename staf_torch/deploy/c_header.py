@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from ..adp import Controller
+from ..adp import Controller, SafetyFilter
 from ..lanes import Program
 from ..lanes.compilation.compiler import run
 from ..lanes.emit.c import checked_names, commented, guarded
@@ -25,8 +25,7 @@ from ..lanes.tree import Tree, flatten, labels
 from ..numerics.checks import fail
 from ..signs import Sign
 from .controllers import (
-    FilteredPolicy,
-    SupervisedPolicy,
+    GuardedPolicy,
     check_bounded,
     check_count,
     check_dtype,
@@ -83,8 +82,8 @@ def export_c(
     name = function_name("export_c", name, module, ["state", *outputs])
     checked_names("export_c", "outputs", outputs, ["state"])
     check_dtype("export_c", module, example)
-    filters = [part for part in module.modules() if isinstance(part, FilteredPolicy)]
-    ahead = any(part.filter.follows for part in filters)
+    guards = [part.guard for part in module.modules() if isinstance(part, GuardedPolicy)]
+    ahead = any(isinstance(guard, SafetyFilter) and guard.follows for guard in guards)
     if isinstance(module, RememberedPolicy) or searches(module):
         check_count("export_c", outputs, 1)
         body, source, compared = _searching(module, example[:1], name, outputs[0])
@@ -205,8 +204,8 @@ def _searching(module: nn.Module, x: Tensor, name: str, output: str) -> tuple[st
         given = _row_c((), module.row(x), type(module).step, module)
         follow, one = given.text(f"{name}_follow", ["cost", "control"]), counted(given.traced)
         return module.c_text(name, follow, output), module.source(one), len(module.searched)
-    assert isinstance(module, FilteredPolicy | SupervisedPolicy)
-    inner = x[:, : module.plant_size] if isinstance(module, FilteredPolicy) else x
+    assert isinstance(module, GuardedPolicy)
+    inner = module.plant_state(x)
     body, source, compared = _searching(module.policy, inner, f"{name}_policy", "control")
     row = {"state": x, "wanted": module.policy(inner)}
     given = _row_c((), row, _restraint_of, module)
@@ -221,7 +220,7 @@ def _searching(module: nn.Module, x: Tensor, name: str, output: str) -> tuple[st
     return "\n".join([body, text, *lines]), whole, compared
 
 
-def _restraint_of(module: FilteredPolicy | SupervisedPolicy) -> Step:
+def _restraint_of(module: GuardedPolicy) -> Step:
     return lambda carry, _, row: (carry, (module.restrained(row["state"], row["wanted"]),))
 
 

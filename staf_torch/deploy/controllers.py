@@ -38,25 +38,7 @@ _LONGEST = 48  # characters of a name that nobody gave
 
 
 class ActorPolicy(nn.Module):
-    """u = -1/2 R^-1 g' Ds(x; x)' Wa: the actor without the learning.
-
-    Example:
-        >>> plant = systems.TwoState()
-        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
-        >>> points = adp.RandomPoints(1, half_width=0.5)
-        >>> learner = adp.ActorCritic(adp.QuadraticBasis(2), plant, cost, points)
-        >>> policy = deploy.ActorPolicy(learner, torch.tensor([0.5, 0.0, 1.0]).double())  # of V*: u* = -h x2
-        >>> policy(torch.tensor([[0.0, 1.0]]).double())
-        tensor([[-3.]], dtype=torch.float64)
-
-        Shown by `staf-export RUN --to c`.
-
-    Args:
-        learner: basis, plant and cost; copied.
-        weights: Wa, (M,).
-
-    Raises:
-        ValueError: if the weights are not (M,) or not finite.
+    """u = -1/2 R^-1 g' Ds(x; x)' Wa of an `ActorCritic`, without the learning; weights Wa (M,).
 
     Source: MATH.md section 4.
     """
@@ -76,74 +58,33 @@ class ActorPolicy(nn.Module):
         return self.cost.policy(self.model.effectiveness(x), gradient)
 
 
-class SupervisedPolicy(nn.Module):
-    """A policy drawn towards the LQR as `Supervised` does it.
+class GuardedPolicy(nn.Module):
+    """A policy (..., n) -> (..., m) drawn towards the LQR by `Supervised`, or behind a `SafetyFilter`.
 
-    Example:
-        >>> plant = systems.TwoState()
-        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
-        >>> lqr = adp.LQR(plant, cost)
-        >>> guarded = deploy.SupervisedPolicy(lqr, adp.Supervised(adp.Feedback(lqr), lqr, cost))
-        >>> guarded(torch.tensor([[0.0, 1.0]]).double()).round(decimals=3)
-        tensor([[-3.]], dtype=torch.float64)
+    Where a constraint depends on the time, t is the last entry of x."""
 
-        Shown by `staf-export RUN --to c`.
-
-    Args:
-        policy: (..., n) -> (..., m).
-        supervisor: whose rule it is; copied.
-    """
-
-    def __init__(self, policy: nn.Module, supervisor: Supervised) -> None:
+    def __init__(self, policy: nn.Module, guard: Supervised | SafetyFilter) -> None:
         super().__init__()
         self.policy = policy
-        self.supervisor = copy.deepcopy(supervisor)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """u: (..., n) -> (..., m)."""
-        return self.restrained(x, self.policy(x))
-
-    def restrained(self, x: Tensor, u: Tensor) -> Tensor:
-        """Return the control in place of u: (..., n), (..., m)."""
-        return self.supervisor.restrain(x, u)
-
-
-class FilteredPolicy(nn.Module):
-    """A policy behind a `SafetyFilter`. Where a constraint depends on the time, t is the last entry of x.
-
-    Example:
-        >>> plant = systems.Linear([[0.0]], [[1.0]])
-        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=1, inputs=1)
-        >>> wall = adp.SafetyFilter(adp.LQR(plant, cost), plant, lambda x, t: x[:, 0] - 0.1 * t, dt=0.01)
-        >>> deploy.policy_of(wall)(torch.tensor([[0.2, 2.0]]).double()).round(decimals=3)  # the wall, at 0.2
-        tensor([[0.1000]], dtype=torch.float64)
-
-        Shown by `staf-export RUN --to c`.
-
-    Args:
-        policy: (..., n) -> (..., m).
-        filter: whose rule it is; copied.
-    """
-
-    def __init__(self, policy: nn.Module, filter: SafetyFilter) -> None:
-        super().__init__()
-        self.policy = policy
-        self.filter = copy.deepcopy(filter)
-        self.filter.controller = Feedback(policy)
+        self.guard = copy.deepcopy(guard)
+        self.guard.controller = Feedback(policy)
 
     def forward(self, x: Tensor) -> Tensor:
         """u: (..., n), or (..., n + 1) with the time, -> (..., m)."""
-        return self.restrained(x, self.policy(x[..., : self.plant_size]))
+        return self.restrained(x, self.policy(self.plant_state(x)))
 
-    @property
-    def plant_size(self) -> int:
-        """n."""
-        return int(self.filter.plant.equilibrium().numel())
+    def plant_state(self, x: Tensor) -> Tensor:
+        """Return x without the time: (..., n)."""
+        if isinstance(self.guard, Supervised):
+            return x
+        return x[..., : self.guard.plant.equilibrium().numel()]
 
     def restrained(self, x: Tensor, u: Tensor) -> Tensor:
         """Return the control in place of u: (..., n), or (..., n + 1) with the time, and (..., m)."""
-        moving = (x[..., :-1], u, x[..., -1]) if self.filter.moving else (x, u)
-        return self.filter.restrain(*moving).control
+        if isinstance(self.guard, Supervised):
+            return self.guard.restrain(x, u)
+        moving = (x[..., :-1], u, x[..., -1]) if self.guard.moving else (x, u)
+        return self.guard.restrain(*moving).control
 
 
 class FoldedRollout(nn.Module):
@@ -155,30 +96,11 @@ class FoldedRollout(nn.Module):
 
     for a translation-invariant kernel grad V^(x) = g, without the factor. Nothing is factored at run time.
 
-    Example:
-        >>> plant = systems.TwoState()
-        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
-        >>> rollout = adp.RolloutPolicy.of_lqr(plant, cost)
-        >>> x = torch.tensor([[1.0, 0.5]]).double()
-        >>> bool((deploy.FoldedRollout(rollout)(x) - rollout.control(x)).abs().max() < 1e-6)
-        True
-
-        Shown by `staf-export RUN --to c`.
-
-    Args:
-        policy: the policy; a copy is kept.
-
-    Raises:
-        ValueError: if its radius depends on the state, or its kernel's core does.
+    Its radius is constant, and its kernel `foldable`.
     """
 
     def __init__(self, policy: RolloutPolicy) -> None:
         super().__init__()
-        if not foldable(policy):
-            raise ValueError(
-                "`FoldedRollout(policy=...)` must have a constant radius and an exponential or radial "
-                f"kernel; got {policy.basis}."
-            )
         basis = policy.basis
         zero = torch.zeros(basis.dim, dtype=torch.float64, device="cpu")
         space = copy.deepcopy(basis).double().local(zero)
@@ -188,7 +110,7 @@ class FoldedRollout(nn.Module):
         slope = grad(lambda z: space.evaluate(z, unit).sum())(at).squeeze(-2)  # (M, n)
         self.moving = basis.kernel.scale_slope == 1.0
         self.policy = copy.deepcopy(policy)
-        if isinstance(policy.base, RolloutPolicy):
+        if isinstance(policy.base, RolloutPolicy) and foldable(policy.base):
             self.policy.base = FoldedRollout(policy.base)
         self.offsets = hold(self, "offsets", basis.centers.offsets(zero).detach().clone())  # (M, n)
         self.fit = hold(self, "fit", torch.cat((value.unsqueeze(-1), slope), dim=-1).detach())  # (M, 1 + n)
@@ -205,9 +127,9 @@ class FoldedRollout(nn.Module):
         return self.policy.cost.policy(self.policy.model.effectiveness(x), gradient)
 
 
-def searches(module: nn.Module) -> TypeGuard[FilteredPolicy | SupervisedPolicy]:
+def searches(module: nn.Module) -> TypeGuard[GuardedPolicy]:
     """Return whether a policy is around one that searches a memory, which no program of a row does."""
-    if not isinstance(module, FilteredPolicy | SupervisedPolicy):
+    if not isinstance(module, GuardedPolicy):
         return False
     return isinstance(module.policy, RememberedPolicy) or searches(module.policy)
 
@@ -256,10 +178,8 @@ def policy_of(
 
 
 def _policy_of(controller: Controller | nn.Module, weights: Tensor | None) -> nn.Module:
-    if isinstance(controller, Supervised):
-        return SupervisedPolicy(_policy_of(controller.controller, weights), controller)
-    if isinstance(controller, SafetyFilter):
-        return FilteredPolicy(_policy_of(controller.controller, weights), controller)
+    if isinstance(controller, Supervised | SafetyFilter):
+        return GuardedPolicy(_policy_of(controller.controller, weights), controller)
     if isinstance(controller, ActorCritic):
         return ActorPolicy(controller, controller.actor if weights is None else weights)
     if weights is not None:
@@ -357,10 +277,8 @@ def made_name(text: str, kind: str) -> str:
 def _of(thing: nn.Module | Controller | None) -> str:
     if thing is None:
         return "policy"
-    if isinstance(thing, FilteredPolicy):
-        return f"filtered_{_of(thing.policy)}"
-    if isinstance(thing, SupervisedPolicy):
-        return f"supervised_{_of(thing.policy)}"
+    if isinstance(thing, GuardedPolicy):
+        return f"{'supervised' if isinstance(thing.guard, Supervised) else 'filtered'}_{_of(thing.policy)}"
     if isinstance(thing, Feedback) and isinstance(thing.policy, nn.Module):
         return _of(thing.policy)
     kind = type(thing).__name__.removesuffix("Policy").removeprefix("Folded")

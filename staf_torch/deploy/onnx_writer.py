@@ -19,7 +19,7 @@ from ..lanes.emit.schedule import Schedule
 from ..lanes.trace.graph import FLAG, NARROW, ROW, STEP, WIDE
 from ..lanes.trace.step import Traced
 from ..lanes.tree import Tree
-from .controllers import FilteredPolicy, searches
+from .controllers import searches
 from .data_sheet import Source, counted, traced_row
 from .remembered_policy import RememberedPolicy
 
@@ -80,7 +80,7 @@ class OnnxWriter:
         if isinstance(module, RememberedPolicy):
             return [(self._remembered(module, x, state), module.problem.inputs)]
         if searches(module):
-            inner = x[:, : module.plant_size] if isinstance(module, FilteredPolicy) else x
+            inner = module.plant_state(x)
             first = state if inner.shape == x.shape else self._take(state, range(inner.shape[-1]))
             wanted = self.policy(module.policy, inner, first)
             u = module.policy(inner)

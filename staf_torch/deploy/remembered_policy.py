@@ -21,22 +21,6 @@ class RememberedPolicy(nn.Module):
     the goal's feedback, each followed from x. All S states that are searched are compared with x, one after
     the other, so that a call takes the same work at every state.
 
-    Example:
-        >>> def step(x, u):  # a cart without friction, for 0.1 s
-        ...     after = torch.stack((x[:, 0] + 0.1 * x[:, 1], x[:, 1] + 0.1 * u[:, 0]), dim=-1)
-        ...     return after, 0.1 * (x.square().sum(-1) + u.square().sum(-1))
-        >>> problem = adp.SampledProblem(step, dim=2, inputs=1, low=-1.0, high=1.0)
-        >>> library = adp.BoxDDP(problem, steps=80, compile=False).solve(torch.tensor([[1.0, 0.0]]).double())
-        >>> memory = adp.GlobalValue(problem, library, region=[1.5, 1.0], candidates=4, lookahead=10)
-        >>> x = torch.tensor([[0.9, 0.0]]).double()
-        >>> bool((deploy.RememberedPolicy(memory)(x) - memory(x)).abs().max() < 1e-12)
-        True
-
-        Shown by `staf_torch/deploy/README.md`.
-
-    Args:
-        memory: of which the tables are copied that a control needs.
-
     Attributes:
         plans: state, control and feedback of every step and at last of the goal, (P, n + m + m n).
         models: state, value, gradient and curvature where candidates end, (E, n + 1 + n + n n).

@@ -35,7 +35,9 @@ from staf_torch import (
     targets,
 )
 from staf_torch.deploy import data_sheet, formats
+from staf_torch.deploy.approximators import LocalApproximator, RidgeApproximator
 from staf_torch.deploy.c_header import runner_c
+from staf_torch.deploy.controllers import ActorPolicy
 
 PLANT = systems.TwoState()
 COST = adp.QuadraticCost(1.0, 1.0, 2, 1)
@@ -123,10 +125,10 @@ def test_folded_series_keeps_its_digits_at_every_radius(
 ) -> None:
     staf = fitted(kernel, radius, directions)
     y = around(staf, 9.9)
-    assert relative(deploy.RidgeApproximator(staf)(y)[0], staf(y)) <= 1e-12
+    assert relative(RidgeApproximator(staf)(y)[0], staf(y)) <= 1e-12
     if radius >= 1e-3:  # else x + z has no digits of z in float32
         near = around(staf, 1.0).float()
-        assert relative(deploy.RidgeApproximator(staf, torch.float32)(near)[0], staf(near.double())) <= 1e-6
+        assert relative(RidgeApproximator(staf, torch.float32)(near)[0], staf(near.double())) <= 1e-6
 
 
 @pytest.mark.parametrize("name", list(CONTROLLERS))
@@ -226,7 +228,7 @@ def test_weights_are_of_an_actor_alone() -> None:
             assert torch.equal(deploy.policy_of(around_it, chosen).policy.weights, policy.weights)
     for wrong in (weights[:2], torch.tensor([math.inf, 0.0, 0.0]).double()):
         with pytest.raises(ValueError, match=r"`ActorPolicy\(weights=...\)` must"):
-            deploy.ActorPolicy(learner, wrong)
+            ActorPolicy(learner, wrong)
 
 
 def test_a_policy_is_a_copy_that_learns_nothing_in_the_dtype_that_is_asked_for() -> None:
@@ -243,16 +245,16 @@ def test_a_policy_is_a_copy_that_learns_nothing_in_the_dtype_that_is_asked_for()
 def test_a_series_is_taken_where_there_is_one_and_holds_up_to_its_reach() -> None:
     staf = fitted(GaussianKernel(0.8), 0.1)
     found = deploy.approximator(staf, reach=2.0)
-    assert isinstance(found, deploy.RidgeApproximator)
+    assert isinstance(found, RidgeApproximator)
     assert (found.radius, found.reach) == (pytest.approx(0.1), 2.0)
     far = torch.zeros_like(found.state)
     far[0] = 0.2
     for share, inside in ((0.999999, True), (1.000001, False)):
         parts = found((found.state + share * far)[None])
         assert all(bool(part.isfinite().all()) is inside for part in parts)
-    assert deploy.RidgeApproximator(staf, torch.float32, reach=2.0).degree < found.degree
-    assert found.degree < deploy.RidgeApproximator(staf, reach=20.0).degree
-    assert type(deploy.approximator(fitted(MaternKernel(2.5), 0.1))) is deploy.LocalApproximator
+    assert RidgeApproximator(staf, torch.float32, reach=2.0).degree < found.degree
+    assert found.degree < RidgeApproximator(staf, reach=20.0).degree
+    assert type(deploy.approximator(fitted(MaternKernel(2.5), 0.1))) is LocalApproximator
 
 
 def test_program_file_comes_back_with_its_note_and_another_format_is_refused(tmp_path: Path) -> None:
@@ -282,11 +284,7 @@ def test_what_cannot_be_deployed_is_refused() -> None:
         (lambda: deploy.trace(nn.Identity(), X, batch=0), r"`trace\(batch=...\)`"),
         (lambda: deploy.trace(nn.Bilinear(2, 2, 1), X), r"^`Bilinear` cannot be exported for any batch"),
         (lambda: deploy.approximator(two), "must have one state; got the batch"),
-        (lambda: deploy.RidgeApproximator(fitted(ExponentialKernel(), 0.9), reach=1e3), "must be smaller"),
-        (
-            lambda: deploy.FoldedRollout(rollout(ExponentialKernel(), StateRadius(0.3, 0.1))),
-            r"FoldedRollout\(policy=...\)` must have a constant radius",
-        ),
+        (lambda: RidgeApproximator(fitted(ExponentialKernel(), 0.9), reach=1e3), "must be smaller"),
     ]
     for call, said in cases:
         with pytest.raises(ValueError, match=said):
