@@ -1,4 +1,4 @@
-"""The policy of `near_optimal`, with its report."""
+"""The policy of `near_optimal`, with its report, and how far it leads."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 import statistics
 import time
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -32,11 +32,12 @@ from .planning.global_value_learning import box_of
 from .planning.receding_horizon import BoundedPlans, StrainedPlans
 from .planning.shooting import DirectShooting
 from .policies.sampled_rollout import SampledRollout
+from .problem.cost import Cost
 from .problem.held_linear import held_stability
 from .problem.rules import slowest
 from .problem.sampled import SampledProblem
-from .reach import Reach, arrived, drawn
 
+_REGULATED = 1e-2  # share of the distance from the set-point that is left
 PLANNED = 3.0  # time constants of the slowest mode in the horizon of plans, whose end must be near the goal
 _STEPS = (12, 60)  # periods in the horizon, at least and at most
 _SHARES = (0.25, 0.5, 1.0, 2.0, 4.0)  # of the spread: boxes of states that a report tries
@@ -44,6 +45,21 @@ _TIMED, _TIMING = (20, 400), 1e5  # controls that are timed: at least, at most; 
 _STATES, _FEWEST, _WORK = 20, 3, 6e6  # of a report: states, or steps of rollouts that take some seconds
 _SHORTER = 0.75  # of the run, where that is of few states: the slowest mode falls to 1e-3
 _SETTLED = 9.2  # time constants for which the loops of a report run: the slowest mode falls to 1e-4
+
+
+class Reach(NamedTuple):
+    """The reach of a policy: how many states of a box around its set-point it regulates, and at what cost.
+
+    Of rows with numbers of their own three numbers a row, NaN for None."""
+
+    way: str  # ``local``: the LQR and its rollouts; ``global``: a memory of optimal trajectories
+    box: tuple[float, ...]  # half widths, in units of the state
+    regulated: (
+        float | Tensor | None
+    )  # share of a sample that ends within 1 % of where it began; None: nobody looked
+    over_best: float | Tensor | None  # mean cost over that of the best trajectories known, of the regulated
+    base: float | Tensor | None  # share that the LQR within its bounds regulates
+    note: str = ""  # why nobody looked, or why there is no global value
 
 
 class NearOptimal(SampledRollout):
@@ -324,6 +340,21 @@ class NearOptimal(SampledRollout):
             _, carried = controller.step(x, carried, none, self.period)
             taken.append((time.perf_counter_ns() - start) / 1000)
         return statistics.median_high(taken[len(taken) // 2 :])  # the first ones warm the caches
+
+
+def drawn(cost: Cost, width: Tensor, count: int, seed: int) -> Tensor:
+    """States drawn uniformly from the box of half widths (n,) around the set-point, (count, n)."""
+    generator = torch.Generator().manual_seed(seed)
+    uniform = torch.rand(count, cost.dim, dtype=torch.float64, generator=generator, device="cpu")
+    away = width * (2 * uniform.to(width) - 1)
+    return away if cost.target is None else away + cost.target
+
+
+def arrived(cost: Cost, x: Tensor, x0: Tensor) -> Tensor:
+    """Return whether states (B, n) are within 1 % of where they began, (B,) bool."""
+    left, began = cost.deviation(x).norm(dim=-1), cost.deviation(x0).norm(dim=-1)
+    close: Tensor = torch.isfinite(left) & (left <= _REGULATED * began)
+    return close
 
 
 def periods_in(seconds: Tensor, period: float) -> Tensor:

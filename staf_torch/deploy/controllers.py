@@ -25,7 +25,7 @@ from ..adp import (
 )
 from ..adp.near_optimal_policy import NearOptimal
 from ..adp.planning.receding_horizon import StrainedPlans
-from ..adp.planning.shooting.optimum import PlanReplay
+from ..adp.planning.shooting.starts import PlanReplay
 from ..lanes.emit.c import checked_names, refused
 from ..lanes.gradients import grad
 from ..lanes.per_row.objects import refuse_rows, row_of

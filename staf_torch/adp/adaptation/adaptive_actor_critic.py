@@ -13,8 +13,7 @@ from ...numerics.checks import fail, positive_real, trailing
 from ...numerics.rows import chosen
 from ...systems.two_state_tracking import TwoStateTracking, feedforward, parametric_drift, regressor
 from ..critic.actor_critic import ActorCritic
-from ..critic.bellman import BellmanTerms
-from ..critic.laws import Weights
+from ..critic.laws import BellmanTerms, Weights
 from ..loop.controller import Controller, Policy
 from ..problem.cost import matvec
 from .history_stack import ConcurrentLearning, Identified

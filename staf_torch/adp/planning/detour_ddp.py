@@ -17,7 +17,7 @@ from ...numerics.riccati import product, riccati_step
 from ..loop.controller import Controller
 from ..problem.cost import QuadraticCost, matvec
 from ..problem.held_plant import Holding
-from .detour_rollout import DetourRollout
+from .obstacles import DetourRollout
 
 _TRIES, _SHORTER = 6, 0.3  # lengths of a step that are tried, each this share of the one before
 

@@ -23,7 +23,7 @@ from staf_torch import (
     rings,
     systems,
 )
-from staf_torch.adp.critic.bellman import bellman_error
+from staf_torch.adp.critic.laws import bellman_error
 
 UNIT = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
 COST = adp.QuadraticCost(2.0, 0.5, dim=2, inputs=1)

@@ -11,8 +11,7 @@ from helpers_adp import BOX, COST, LAWS, PLANT, learner
 from torch import Tensor
 
 from staf_torch import adp, rows, systems
-from staf_torch.adp.critic.bellman import BellmanTerms
-from staf_torch.adp.critic.laws import ActorCriticLaw, Weights, solve_definite
+from staf_torch.adp.critic.laws import ActorCriticLaw, BellmanTerms, Weights, solve_definite
 from staf_torch.numerics.runge_kutta import runge_kutta_step
 
 GAINS = {

@@ -10,7 +10,7 @@ from helpers import tensor
 from torch import Tensor
 
 from staf_torch import adp, systems
-from staf_torch.adp.planning.detour_rollout import Detour
+from staf_torch.adp.planning.obstacles import Detour
 
 PLANE = systems.Linear(torch.eye(4).roll(2, dims=1).triu().tolist(), torch.eye(4)[:, 2:].tolist())
 COST = adp.QuadraticCost(1.0, 1.0, dim=4, inputs=2, low=-1.0, high=1.0)

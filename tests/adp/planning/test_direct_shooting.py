@@ -12,7 +12,7 @@ from helpers_adp import COST, PLANT, uniform
 from torch import Tensor
 
 from staf_torch import adp, systems
-from staf_torch.adp.critic.bellman import value_gradient
+from staf_torch.adp.critic.laws import value_gradient
 
 DOUBLE = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
 LINEAR = systems.Linear([[0.0, 1.0], [2.0, -1.0]], [[0.0], [1.0]])

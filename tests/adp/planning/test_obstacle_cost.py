@@ -9,7 +9,7 @@ from helpers_swingup import cost_of as cost_along
 from torch import Tensor
 
 from staf_torch import adp, systems
-from staf_torch.adp.planning.obstacle_cost import AvoidancePlans
+from staf_torch.adp.planning.obstacles import AvoidancePlans
 
 LINE = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
 

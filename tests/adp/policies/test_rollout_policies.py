@@ -24,7 +24,7 @@ from staf_torch import (
     rings,
     systems,
 )
-from staf_torch.adp.critic.bellman import value_gradient
+from staf_torch.adp.critic.laws import value_gradient
 
 LQR = adp.LQR(PLANT, COST)
 X = unit(3, 2, seed=1)

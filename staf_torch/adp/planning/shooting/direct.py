@@ -31,10 +31,27 @@ from ...problem.rules import (
     set_point,
 )
 from ..trajectories import Trajectories, chosen
-from .mesh import MOST, end_value, graded, halved, regulator, split, times
 from .newton import Interval, MeshPlan, NewtonSolution, follow, minimise, replay, why_none
-from .optimum import Optimum
-from .starts import ROWS, PlanSearch, cheapest, dearer, guesses, guided, joined, merged, replaced, selected
+from .starts import (
+    MOST,
+    ROWS,
+    Optimum,
+    PlanSearch,
+    cheapest,
+    dearer,
+    end_value,
+    graded,
+    guesses,
+    guided,
+    halved,
+    joined,
+    merged,
+    regulator,
+    replaced,
+    selected,
+    split,
+    times,
+)
 
 _GAP = 1e-3  # share of the value by which a stationary control may miss the minimum of the Hamiltonian
 _NEAR = (0.5, 2.0)  # value over the LQR's, inside which one start is believed,

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ....systems import ControlAffineSystem
-from ...critic.bellman import value_gradient
+from ...critic.laws import value_gradient
 from ...loop.result import LoopResult
 from ...loop.simulation import AdpProblem
 from ...problem.cost import QuadraticCost

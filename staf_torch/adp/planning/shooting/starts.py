@@ -1,4 +1,4 @@
-"""Starts of direct shooting: guesses, searches in equal steps, and the best of what they lead to."""
+"""Meshes, defaults and starts of direct shooting, and its result: the best of what starts lead to."""
 
 from __future__ import annotations
 
@@ -6,27 +6,37 @@ import functools
 import logging
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from ....lanes.row_numbers import some_rows
+from ....lanes.per_row.decisions import decided, numbers_of_rows
+from ....lanes.per_row.objects import made_by_rows
+from ....lanes.row_numbers import over_rows, some_rows
+from ....numerics.checks import fail, integer, positive_real
+from ....numerics.linalg import Matrix, positive_semidefinite, square
+from ....numerics.repr_text import span
 from ....systems import Plant
-from ...loop.controller import Policy
-from ...problem.cost import Cost
+from ...loop.controller import LQR, Controller, Policy, Value
+from ...problem.cost import Cost, quadratic
+from ...problem.rules import check_regulates, check_value
 from ...problem.sampled import SampledProblem
 from ..ddp import BoxDDP
 from ..global_value import GlobalValue
 from ..global_value_learning import best_from, box_of, global_value_of, held_plans
 from ..trajectories import Trajectories
-from .newton import MeshPlan
-from .optimum import Optimum
+from .newton import Interval, MeshPlan
 
+_GRADING = 6.0  # ratio of a mesh's last interval to the first
+_log = logging.getLogger(__name__)
+_DECAY = 9.2  # time constants of the slowest mode in the horizon: it falls to 1e-4
+_RESOLVED = 0.5  # mean interval in time constants of the fastest mode
+_LEAST = 80  # intervals
+MOST = 120  # intervals that are chosen at most where inputs are bounded
 _SHARES = (0.02, 0.04, 0.08, 0.14, 0.22, 0.32)  # of the horizon, for which a constant control is held first
 _KNOTS = 6  # of a random spline
 _REACH = 3.0  # times the largest control that the base asks for, where there is no bound
-_log = logging.getLogger(__name__)
 _BEST = 2  # plans of a state that begin with a held bound
 _REMEMBERED = 2  # states of a plant at most, of which a memory is learnt
 ROWS = 256  # states solved from at once: a graph of second derivatives is kept for each
@@ -34,6 +44,187 @@ _SAME = 1e-4  # relative, of the values of two starts that found the same
 _MIRRORED = 1e-9  # relative difference of cost below which two guesses are one and its mirror image
 _ROUGH = 1e-3  # relative: what a mesh may add to the value of the base's own control
 _LONE = "local: one start alone"
+
+
+def graded(horizon: float, intervals: int) -> Tensor:
+    """Times of a mesh whose intervals grow in geometric progression: (N + 1,) from 0 to the horizon."""
+    power = (
+        math.log(_GRADING)
+        * torch.arange(intervals + 1, dtype=torch.float64, device="cpu")
+        / max(1, intervals - 1)
+    )
+    return horizon * power.expm1() / power[-1].expm1()
+
+
+def halved(time: Tensor) -> Tensor:
+    """Return the times and those half-way: (N + 1,) -> (2N + 1,)."""
+    middle = 0.5 * (time[1:] + time[:-1])
+    return torch.cat((time[:1], torch.stack((middle, time[1:]), dim=-1).flatten()))
+
+
+def split(stage: Interval, plan: MeshPlan, feedback: Tensor, lengths: Tensor) -> tuple[MeshPlan, Tensor]:
+    """Split the N intervals of a plan, of these lengths (N,), in half: the same control and a feedback
+    around it, (B, N, 2m, n) -> (B, 2N, 2m, n); the cost is the old one."""
+    first, last = plan.control.chunk(2, dim=-1)
+    middle = 0.5 * (first + last)
+    early, late = torch.cat((first, middle), dim=-1), torch.cat((middle, last), dim=-1)
+    between, _ = stage.advance(plan.state[:, :-1], early, 0.5 * lengths.expand(plan.control.shape[:2]))
+    state = torch.stack((plan.state[:, :-1], between), dim=2).flatten(1, 2)
+    state = torch.cat((state, plan.state[:, -1:]), dim=1)
+    control = torch.stack((early, late), dim=2).flatten(1, 2)
+    return MeshPlan(state, control, plan.cost), feedback.repeat_interleave(2, dim=1)
+
+
+def rates_of(system: Plant, lqr: LQR) -> tuple[Tensor, Tensor]:
+    """The slowest decay and the fastest rate of the LQR's modes, 1/s, () each."""
+    a, b = system.linearisation(lqr.cost.target, lqr.cost.target_input)
+    modes = torch.linalg.eigvals(a.to(lqr.p) - b.to(lqr.p) @ lqr.k)
+    return -modes.real.max(), modes.abs().max()
+
+
+def regulator(system: Plant, cost: Cost, horizon: float | None, ends: bool) -> LQR | None:
+    """Return the LQR of a problem; None where there is none and a horizon, s, does without, with a
+    warning if a plan ``ends`` with its value. Refused where there is neither."""
+    try:
+        decided(lambda: check_regulates("DirectShooting", system, cost))
+        return LQR(system, cost)
+    except ValueError as error:
+        why = str(error)
+    if horizon is None:
+        raise ValueError(
+            f"`DirectShooting(horizon=...)` must be given, in s, where there is no LQR: {why} "
+            "Give a `terminal` as well, V_T of x or S of e'Se, where the end is to count."
+        )
+    if ends:
+        _log.warning(
+            "`DirectShooting` has no LQR (%s): the end of a plan costs nothing: give `terminal`, V_T of x"
+            " or S of e'Se, or a horizon after which nothing counts.",
+            why,
+        )
+    return None
+
+
+def end_value(terminal: Value | Matrix | None, cost: Cost, lqr: LQR | None) -> Value:
+    """V_T: as given, of the cost, of the LQR, or nothing."""
+    if terminal is None:
+        if cost.ending is not None:
+            return cost.terminal
+        return (lambda x: torch.zeros_like(x[..., 0])) if lqr is None else lqr.value
+    if callable(terminal):
+        own = check_value("DirectShooting", "terminal", terminal, cost)
+    else:
+
+        def checked() -> Tensor:
+            end = square("DirectShooting", "terminal", terminal, cost.dim)
+            return positive_semidefinite("DirectShooting", "terminal", end, cost.dim)
+
+        end = made_by_rows(checked)
+
+        def own(x: Tensor) -> Tensor:
+            return quadratic(end, cost.deviation(x))
+
+    return lambda x: over_rows(own, x)
+
+
+def times(
+    system: Plant, cost: Cost, lqr: LQR | None, horizon: float | None, intervals: int | None
+) -> tuple[float, int]:
+    """Return the horizon, s, and the even number of its intervals, checked."""
+    slowest, fastest = 1.0, 0.0
+    if lqr is not None:
+        slow, fast = numbers_of_rows(lambda: rates_of(system, lqr)).numbers
+        slowest, fastest = float(slow.min()), float(fast.max())
+    horizon = positive_real("DirectShooting", "horizon", _DECAY / slowest if horizon is None else horizon)
+    if intervals is None:
+        most = math.inf if cost.bounds is None else MOST
+        intervals = 2 * round(0.5 * min(max(_LEAST, horizon * fastest / _RESOLVED), most))
+    intervals = integer("DirectShooting", "intervals", intervals, least=4)
+    if intervals % 2:
+        raise fail("DirectShooting", "intervals", "must be even", intervals)
+    return horizon, intervals
+
+
+class Optimum(NamedTuple):
+    """The best trajectories found from x0, a row each; NaN in the rows where none was found.
+
+    Example:
+        >>> plant = systems.TwoState()
+        >>> cost = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)
+        >>> found = adp.DirectShooting(plant, cost, horizon=2.0).solve(torch.tensor([[0.2, 0.1]]).double())
+        >>> bool(found.converged.all()), bool(found.mesh_error.max() < 1e-4)
+        (True, True)
+
+        Shown by `staf experiment=adp_three_state`.
+    """
+
+    value: Tensor  # V*(x0), (B,): the cost of the control that was found
+    gradient: Tensor  # grad V*(x0), (B, n)
+    control: Tensor  # u*(x0), (B, m)
+    state: Tensor  # (B, N + 1, n)
+    time: Tensor  # (N + 1,) seconds
+    mesh_error: Tensor  # relative change of the value since a mesh of half as many intervals, (B,); inf if
+    # that mesh was too coarse to converge on
+    horizon_error: Tensor  # share of the value that is the terminal cost, (B,)
+    iterations: Tensor  # Newton steps, all meshes and starts together, (B,)
+    converged: Tensor  # (B,) bool: stationary in u, and no other start was known to be lower by 1e-4
+    plan: Tensor  # u at the start and at the end of every interval, linear in between, (B, N, 2, m)
+    optimality: Tensor  # (B,) what is left of the Hamiltonian over its minimum, as a share of the value
+    reason: tuple[str, ...]  # a row: "" where it converged, else why it did not, or "local: ..."
+
+    def __repr__(self) -> str:
+        rows, times = self.state.shape[:2]
+        found = int(self.converged.sum())
+        why = sorted({reason for reason in self.reason if reason})
+        more = f"; {why[0]}" + (f" (and {len(why) - 1} more reasons)" if len(why) > 1 else "") if why else ""
+        return (
+            f"Optimum({rows} states, value {span(self.value)}, {found} converged, {times - 1} intervals over "
+            f"{float(self.time[-1]):.4g} s{more})"
+        )
+
+    def to(self, device: torch.device) -> Optimum:
+        """Return the optimum on a device."""
+        moved: dict[str, Any] = {
+            name: part.to(device) for name, part in self._asdict().items() if name != "reason"
+        }
+        return self._replace(**moved)
+
+    def replay(self) -> PlanReplay:
+        """A controller that runs the plan of every row, open loop; it holds the mean over each period."""
+        return PlanReplay(self.time, self.plan)
+
+
+class PlanReplay(Controller):
+    """u(t) of a plan (B, N, 2, m), u at the start and the end of every interval between times (N + 1,)
+    from 0, linear on each, averaged over each period; its last value afterwards."""
+
+    def __init__(self, time: Tensor, plan: Tensor) -> None:
+        super().__init__()
+        self.register_buffer("time", time)
+        self.register_buffer("plan", plan)
+        self.time: Tensor
+        self.plan: Tensor
+
+    def init(self, x0: Tensor) -> Tensor:
+        """The time, (B, 1)."""
+        if len(x0) != len(self.plan):
+            raise ValueError(f"This plan is for {len(self.plan)} initial states; got {len(x0)}.")
+        return x0.new_zeros(len(x0), 1)
+
+    def step(self, x: Tensor, carried: Tensor, uniform: Tensor, dt: float) -> tuple[Tensor, Tensor]:
+        now = float(carried[0, 0])
+        u = (self.integral(now + dt) - self.integral(now)) / dt
+        return u.to(x), carried + dt
+
+    def integral(self, until: float) -> Tensor:
+        """int_0^t u dt, (B, m)."""
+        lengths = self.time.diff()
+        share = ((until - self.time[:-1]) / lengths).clamp(0.0, 1.0)
+        first, last = self.plan.unbind(2)
+        weights = (lengths * share)[:, None]
+        reached = first + 0.5 * share[:, None] * (last - first)
+        beyond = max(0.0, until - float(self.time[-1]))
+        total: Tensor = (weights * reached).sum(1) + beyond * last[:, -1]
+        return total
 
 
 class StartControl(NamedTuple):
