@@ -31,8 +31,8 @@ from ..results.run_directory import History
 from ..settings.adp import adp_problem
 from ..settings.chase import chase_problem
 from ..settings.trust import foreign_settings, refusal
-from ..sweeps.batching import chain
 from ..sweeps.hydra_compat import everything_trusted, working_directory_imports
+from ..sweeps.job import chain
 from ..systems import Units
 
 _POINTS = 1000

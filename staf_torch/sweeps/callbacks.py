@@ -25,9 +25,8 @@ from ..results import run_record as records
 from ..results.files import COMPLETED, FAILED, PAGE, ROWS, links_in, visible
 from ..results.reader import RecordedRun, collect
 from . import lock
-from .batching import sentence
 from .hydra_compat import as_typed, end_sweep, parse_override, sweep_size
-from .job import PRINTS
+from .job import PRINTS, sentence
 from .report import write_report
 
 _log = logging.getLogger(__name__)

@@ -18,9 +18,9 @@ from .. import __version__
 from ..results import run_record as records
 from ..results.files import FREE, is_free, visible
 from ..settings.trust import may_run_code
-from .batching import USER_ERRORS, sentence
 from .callbacks import farewell, refuse_many
 from .hydra_compat import overrides_in, parse_override
+from .job import USER_ERRORS, sentence
 from .workers import name_and_code, what_ended
 
 _RESUME = "sweep.resume="

@@ -18,8 +18,8 @@ from typing import Any
 from ..numerics.checks import choice, integer
 from ..settings.plain import ManySettings
 from ..signs import Progress
-from .batching import Batch, Done, Failed, Flat, LostError, Outcome, batches, solve
 from .hydra_compat import env_override
+from .job import Batch, Done, Failed, Flat, LostError, Outcome, batches, solve
 from .workers import (
     Worker,
     beginning,

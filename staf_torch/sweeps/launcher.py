@@ -20,10 +20,9 @@ from ..results import run_record as records
 from ..results.files import ROWS, RUN, partial_name
 from ..signs import Pace, Progress, Sign, write
 from . import lock, table, workers
-from .batching import Outcome, reason
 from .executors import Executor, compute, executor
-from .hydra_compat import JobReturn, JobStatus, Plan, SweepJobs, without_hydra_overrides
-from .job import PRINTS, execute, objective, silence_terminal
+from .hydra_compat import Job, JobReturn, JobStatus, Plan, SweepJobs, filter_overrides
+from .job import PRINTS, Outcome, execute, objective, reason, silence_terminal
 
 _log = logging.getLogger(__name__)
 Task = Callable[[DictConfig], Any]
@@ -113,7 +112,7 @@ class SweepProgress:
 
 def job_name(num: int, overrides: Sequence[str]) -> str:
     """Return `job 3 (kernel=gaussian seed=1)`."""
-    return f"job {num} ({' '.join(records.own(without_hydra_overrides(overrides)))})"
+    return f"job {num} ({' '.join(records.own(filter_overrides(overrides)))})"
 
 
 class Launch:
@@ -192,7 +191,7 @@ class Launch:
             for num, task in self._tasks(numbered, plan, set(returns), progress, stack):
                 workers.check()
                 self._still_there(len(returns), len(numbered))
-                ended = self._jobs.run(task, self._jobs.job(num, numbered[num], plan, index[num]))
+                ended = self._jobs.run(task, Job(self._jobs, num, numbered[num], plan, index[num]))
                 ended.cfg = ended.hydra_cfg = None  # settings of all jobs are memory
                 returns[num] = ended
                 wrong = ended.status == JobStatus.FAILED
@@ -218,7 +217,7 @@ class Launch:
         if not records.resumed(self._jobs.master):
             return found
         for index, (num, overrides) in enumerate(numbered.items()):
-            job = self._jobs.job(num, overrides, plan, index)
+            job = Job(self._jobs, num, overrides, plan, index)
             record = records.RunRecord(job.settings, job.prepared.choices, overrides, compiler(), job.flat)
             metrics = record.finished_before(job.directory)
             if metrics is not None:

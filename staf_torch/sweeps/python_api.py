@@ -32,10 +32,9 @@ from ..tables import Layout, Style, Table, html_text, tabulate
 from ..tables.aggregate import in_order, lost_share
 from ..tables.model import data_frame, require, significant
 from . import callbacks
-from .batching import sentence
 from .command import command_line
 from .hydra_compat import application
-from .job import PRINTS, Refused, execute, silence_terminal
+from .job import PRINTS, Refused, execute, sentence, silence_terminal
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

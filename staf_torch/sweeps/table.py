@@ -28,10 +28,9 @@ from ..settings.chase import make_metrics, units_of
 from ..settings.plain import ManySettings
 from ..signs import Progress
 from . import workers
-from .batching import Computed, Failed, LostError, Outcome, Written, are_light, completion, reason
 from .executors import Executor, compute
 from .hydra_compat import SweepJobs
-from .job import recorded
+from .job import Computed, Failed, LostError, Outcome, Written, are_light, completion, reason, recorded
 
 _log = logging.getLogger(__name__)
 SUMS = f".{ROWS}.sums"

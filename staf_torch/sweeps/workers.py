@@ -27,7 +27,8 @@ from omegaconf import DictConfig
 
 from ..figures.style import FigurePaper, in_a_sweep, printed_on
 from ..signs import SHOWN
-from .batching import (
+from .hydra_compat import trusted, trusted_packages
+from .job import (
     DEFERRED,
     Batch,
     Computed,
@@ -40,7 +41,6 @@ from .batching import (
     completion,
     solve,
 )
-from .hydra_compat import trusted, trusted_packages
 
 _NUMBERS = (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
 _USUAL = (signal.SIG_DFL, signal.default_int_handler)

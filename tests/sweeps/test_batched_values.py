@@ -21,8 +21,8 @@ from staf_torch.experiments.gradient_chase import ChaseSolution, GradientChase
 from staf_torch.results import run_record
 from staf_torch.signs import SHOWN
 from staf_torch.sweeps import batching
-from staf_torch.sweeps.batching import DEFERRED, Computed, Failed, Outcome
 from staf_torch.sweeps.hydra_compat import parse_override
+from staf_torch.sweeps.job import DEFERRED, Computed, Failed, Outcome
 
 SHORT = ("dt=0.05", "duration=0.5", "settle_time=0.25", "figures=false")
 

@@ -16,7 +16,7 @@ from omegaconf.errors import ConfigKeyError, OmegaConfBaseException
 
 from staf_torch.experiments.registry import BatchedExperiment, Metrics
 from staf_torch.signs import SHOWN, Progress
-from staf_torch.sweeps.batching import (
+from staf_torch.sweeps.job import (
     DEFERRED,
     Computed,
     Failed,

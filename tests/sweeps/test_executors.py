@@ -22,8 +22,8 @@ from staf_torch.experiments.registry import Metrics
 from staf_torch.results.files import write_metrics
 from staf_torch.settings.plain import ManySettings
 from staf_torch.signs import SHOWN, Progress
-from staf_torch.sweeps.batching import Batch, Done, Failed, LostError, Outcome, Written, completion, solve
 from staf_torch.sweeps.executors import Elsewhere, GivenUpError, Task, compute, executor
+from staf_torch.sweeps.job import Batch, Done, Failed, LostError, Outcome, Written, completion, solve
 from staf_torch.sweeps.workers import pack, solve_elsewhere, unpack
 
 SHORT = ["duration=0.05", "settle_time=0", "figures=false", "history=false"]

@@ -112,7 +112,7 @@ import dataclasses
 from pathlib import Path
 from staf_torch.experiments.registry import BatchedExperiment
 from staf_torch.settings.plain import to_read
-from staf_torch.sweeps.batching import LostError
+from staf_torch.sweeps.job import LostError
 
 SCALE = 1.0
 

@@ -12,7 +12,7 @@ import pytest
 import worker_tasks
 from command_line import environment
 
-from staf_torch.sweeps.batching import LostError
+from staf_torch.sweeps.job import LostError
 from staf_torch.sweeps.workers import Worker, ready
 
 LOST = {

@@ -3,6 +3,7 @@
 from hydra.core.utils import JobReturn as JobReturn
 from hydra.core.utils import JobStatus as JobStatus
 from hydra.core.utils import env_override as env_override
+from hydra.core.utils import filter_overrides as filter_overrides
 
 from .composing import Composer as Composer
 from .composing import as_typed as as_typed
@@ -17,7 +18,6 @@ from .jobs import About as About
 from .jobs import Job as Job
 from .jobs import Plan as Plan
 from .jobs import SweepJobs as SweepJobs
-from .jobs import without_hydra_overrides as without_hydra_overrides
 from .program import VERSION as VERSION
 from .program import Application as Application
 from .program import application as application

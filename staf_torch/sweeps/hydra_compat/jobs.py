@@ -1,4 +1,8 @@
-"""A job of a sweep, as Hydra's launchers run it."""
+"""A job of a sweep, as Hydra's launchers run it.
+
+OmegaConf takes ten milliseconds a job for Hydra's node, its log and the texts of `.hydra/`. Jobs of a sweep
+differ in a few lines there, so that the first job of a kind is asked, and the others are changed copies.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +11,15 @@ import copy
 import functools
 import logging
 import os
+import re
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
+import yaml
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.types import Override
 from hydra.core.utils import (
     JobReturn,
     JobRuntime,
@@ -27,11 +34,11 @@ from hydra.core.utils import (
 from hydra.experimental.callback import Callback
 from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
+from omegaconf._utils import OmegaConfDumper
 
 from ...settings.plain import ManySettings
-from .composing import Composer, as_typed, directory_of, parse_override, take_directory
+from .composing import Composer, as_typed, directory_name, directory_of, parse_override, take_directory
 from .inside import HAS_WHITELIST, configure_logging
-from .job_node import NodeOfJob, Texts, absolute
 
 Plan = tuple[ManySettings, Sequence[Mapping[str, Any]]]
 """The settings of many jobs, and the same by dotted keys."""
@@ -99,7 +106,7 @@ class SweepJobs:
         with read_write(config.hydra), open_dict(config.hydra):
             config.hydra.job.id = str(num)
             config.hydra.job.num = num
-            config.hydra.runtime.output_dir = absolute(directory_of(config))
+            config.hydra.runtime.output_dir = os.path.abspath(directory_of(config))
         return config
 
     def _at_the_same_time(self, config: DictConfig) -> DictConfig:
@@ -112,12 +119,6 @@ class SweepJobs:
         """Return whether the sweeper hands over all jobs at once."""
         sweeper = self.master.hydra.sweeper
         return self.choices.get("hydra/sweeper") == "basic" and sweeper.get("max_batch_size") is None
-
-    def job(self, num: int, overrides: Sequence[str], plan: Plan | None = None, index: int = 0) -> Job:
-        """Return job ``num``, which is the one of that index in the plan that `many` returned."""
-        plain, flat = (None, None) if plan is None else (plan[0].plain(index), plan[1][index])
-        settings = self.settings if plain is None else lambda _: plan[0].made(index)  # type: ignore[index]
-        return Job(self, num, overrides, settings, plain, flat)
 
     def directory(self, num: int, overrides: Sequence[str]) -> Path:
         """Return the run directory of job ``num``: its number, where nobody says otherwise."""
@@ -134,13 +135,13 @@ class SweepJobs:
             if leader.leads:
                 self._leaders[kind] = leader
             return leader
-        return leader.followed(num, parsed, absolute(self._folder / str(num)))
+        return leader.followed(num, parsed, os.path.abspath(self._folder / str(num)))
 
     def refuse_shared(self, numbered: Mapping[int, Sequence[str]]) -> None:
         """Raise ValueError if two jobs have one directory."""
         taken: dict[str, str] = {}
         for num, job in () if self._numbered(numbered.values()) else numbered.items():
-            name = " ".join(without_hydra_overrides(job))
+            name = " ".join(filter_overrides(job))
             take_directory(taken, self.directory(num, job), f"job {num} ({name})")
 
     def _numbered(self, jobs: Iterable[Sequence[str]]) -> bool:
@@ -211,23 +212,12 @@ class SweepJobs:
 
 
 class Job:
-    """A job of a sweep; its configuration with Hydra's node is composed where somebody asks for it.
+    """A job of a sweep, of that index in a plan; its configuration with Hydra's node is composed where
+    somebody asks for it. While it runs `HydraConfig.get()` returns its node."""
 
-    While it runs `HydraConfig.get()` returns its node. ``settings`` composes the settings by the overrides;
-    ``plain`` and ``flat`` are the settings as a tree and by dotted keys, where they are known so.
-    """
-
-    def __init__(
-        self,
-        jobs: SweepJobs,
-        num: int,
-        overrides: Sequence[str],
-        settings: Callable[[Sequence[str]], DictConfig],
-        plain: Mapping[str, Any] | None,
-        flat: Mapping[str, Any] | None,
-    ) -> None:
+    def __init__(self, jobs: SweepJobs, num: int, overrides: Sequence[str], plan: Plan, index: int) -> None:
         self._jobs, self.num, self.overrides = jobs, num, overrides
-        self._settings, self._plain, self.flat = settings, plain, flat
+        self._planned, self._index, self.flat = plan[0], index, plan[1][index]
 
     @functools.cached_property
     def prepared(self) -> NodeOfJob:
@@ -242,7 +232,9 @@ class Job:
     @functools.cached_property
     def settings(self) -> DictConfig:
         """The settings as the task sees them, its own to change."""
-        return self._settings(self.overrides)
+        if self._planned.plain(self._index) is None:
+            return self._jobs.settings(self.overrides)
+        return self._planned.made(self._index)
 
     @functools.cached_property
     def config(self) -> DictConfig:
@@ -258,7 +250,7 @@ class Job:
 
     def texts(self, texts: Texts) -> dict[str, str]:
         """Return the files of `.hydra/`, by name, as Hydra writes them."""
-        written = self._plain
+        written: Mapping[Any, Any] | None = self._planned.plain(self._index)
         if written is None:
             written = cast(dict[str, Any], OmegaConf.to_container(self.settings, enum_to_str=True))
         return {
@@ -301,11 +293,6 @@ def _listen(callbacks: Any, settings: DictConfig) -> bool:
     return False
 
 
-def without_hydra_overrides(overrides: Sequence[str]) -> list[str]:
-    """Return the overrides that are not about Hydra's own node."""
-    return list(filter_overrides(overrides))
-
-
 @contextlib.contextmanager
 def handlers_aside() -> Iterator[None]:
     """Hide the handlers of the process from `logging.config`, which closes all that it knows of.
@@ -337,3 +324,117 @@ def _loggers() -> list[tuple[str, logging.Logger]]:
     """The loggers of the process but the root, by their names."""
     known = logging.Logger.manager.loggerDict
     return [(name, each) for name, each in known.items() if isinstance(each, logging.Logger)]
+
+
+_KNOWN = ("hydra.runtime.output_dir", "hydra.job.name")  # what a log may refer to in a job that follows
+_MOST = 1000  # entries of YAML that are kept
+
+
+class NodeOfJob(NamedTuple):
+    """Facts that Hydra's node of a job says."""
+
+    directory: str  # absolute
+    node: Mapping[str, Any]  # as it is written: interpolations are not looked up
+    log: Any  # `hydra.job_logging`, resolved; None: Hydra's own
+    verbose: Any
+    env: Mapping[str, str]  # variables of the job's own
+    folder: str | None  # for the settings
+    choices: Mapping[str, str | None]  # of each group
+    overrides: list[str]
+
+    @classmethod
+    def of(cls, config: DictConfig) -> NodeOfJob:
+        """Read it in a configuration with Hydra's node."""
+        node: Any = config.hydra
+        log = node.job_logging
+        return cls(
+            str(node.runtime.output_dir),
+            cast(dict[str, Any], OmegaConf.to_container(node, enum_to_str=True)),
+            None if log is None else OmegaConf.to_container(log, resolve=True),
+            node.verbose,
+            {str(name): str(value) for name, value in node.job.env_set.items()},
+            node.output_subdir,
+            {str(group): choice for group, choice in node.runtime.choices.items()},
+            as_typed(node.overrides.task),
+        )
+
+    @property
+    def leads(self) -> bool:
+        """Return whether that of other jobs follows from this one."""
+        refers = re.findall(r"\$\{([^}]*)\}", str(self.node["job_logging"]))
+        own = str((self.node["job"]["name"], self.node["job"]["env_set"], self.node["output_subdir"]))
+        return set(refers) <= set(_KNOWN) and "${" not in own
+
+    def followed(self, num: int, parsed: Sequence[Override], directory: str) -> NodeOfJob:
+        """Return that of job ``num``, which differs in these overrides and in its directory alone."""
+        node, job = dict(self.node), dict(self.node["job"])
+        lines = [str(one.input_line) for one in parsed]
+        job |= {"id": str(num), "num": num}
+        if "${" not in str(job["override_dirname"]):  # it is one in Hydra 1.4
+            job["override_dirname"] = directory_name(job["config"]["override_dirname"], parsed)
+        node["overrides"] = {**node["overrides"], "task": lines}
+        node["runtime"] = {**node["runtime"], "output_dir": directory}
+        node["job"] = job
+        log = _moved(self.log, self.node["job_logging"], self.directory, directory)
+        return self._replace(directory=directory, node=node, log=log, overrides=lines)
+
+
+def _moved(value: Any, written: Any, before: str, now: str) -> Any:
+    """Return resolved settings with another directory, where ``written`` names it."""
+    if isinstance(value, dict):
+        return {key: _moved(inner, written[key], before, now) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [_moved(inner, own, before, now) for inner, own in zip(value, written, strict=True)]
+    return value.replace(before, now) if isinstance(value, str) and _KNOWN[0] in str(written) else value
+
+
+class Texts:
+    """YAML as OmegaConf writes it; an entry is emitted once, however many files have it."""
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[str, str, int], str] = {}
+
+    def mapping(self, content: Mapping[Any, Any], depth: int = 0) -> str:
+        """Return the lines of a mapping that is in so many others."""
+        return "".join(self._entry(key, value, depth) for key, value in content.items()) or "{}\n"
+
+    def lines(self, content: Sequence[str]) -> str:
+        """Return a list of texts."""
+        return "".join(self._kept("", one, 0, functools.partial(_yaml, [one])) for one in content) or "[]\n"
+
+    def _entry(self, key: Any, value: Any, depth: int) -> str:
+        nested = isinstance(value, Mapping) and bool(value)
+
+        def emitted() -> str:
+            if nested:
+                return _line(key, 0, depth).removesuffix(" 0\n") + "\n" + self.mapping(value, depth + 1)
+            return _line(key, dict(value) if isinstance(value, Mapping) else value, depth)
+
+        # The whole node of Hydra is another one in every job.
+        return emitted() if nested and not depth else self._kept(repr(key), value, depth, emitted)
+
+    def _kept(self, key: str, value: Any, depth: int, emitted: Callable[[], str]) -> str:
+        known = key, repr(value), depth
+        if known not in self._known:
+            if len(self._known) >= _MOST:
+                self._known.clear()
+            self._known[known] = emitted()
+        return self._known[known]
+
+
+def _line(key: Any, value: Any, depth: int) -> str:
+    """Return the lines of a key whose value is no mapping."""
+    nested = {key: value}
+    for _ in range(depth):
+        nested = {"x": nested}
+    return _yaml(nested).split("\n", depth)[-1]
+
+
+def _yaml(content: Any) -> str:
+    text: str = yaml.dump(content, Dumper=_DUMPER, allow_unicode=True, sort_keys=False)
+    return text
+
+
+_BASE: Any = getattr(yaml, "CDumper", yaml.Dumper)  # emitted in C where that is built: a tenth of the time
+_DUMPER: Any = type("_Dumper", (_BASE,), {})
+_DUMPER.add_representer(str, OmegaConfDumper.str_representer)
