@@ -247,17 +247,17 @@ def own_law(
 
     found = {name: column(name, value) for name, value in numbers.items() if value is not None}
     found.setdefault("robust", like.new_full((streams,), torch.inf, dtype=torch.float64))
-    least = math.sqrt(64 * torch.finfo(dtype).eps)
+    least = math.sqrt(64 * torch.finfo(dtype).eps)  # less noise leaves no digit of the covariance
+    enough = (found["noise"] / found["amplitude"]).square() >= 64 * torch.finfo(dtype).eps
     rules = (
-        ("noise", found["noise"] >= least * found["amplitude"], f"must be at least {least:.1e} amplitude"),
+        ("noise", enough, f"must be at least {least:.1e} amplitude in {dtype}"),
         ("forgetting", found["forgetting"] <= 1, "must be in (0, 1]"),
     )
     for name, held, rule in rules:
         if fails(held):
             row = int((~held).nonzero()[0])
-            raise fail(
-                call, name, f"{rule} in every row, which it is not in row {row}", float(found[name][row])
-            )
+            rule += f" in every row, which it is not in row {row}" if streams > 1 else ""
+            raise fail(call, name, rule, float(found[name][row]))
     return found
 
 

@@ -17,7 +17,7 @@ from ..kernels import NAMED, GaussianKernel, Kernel
 from ..lanes.gradients import refuse_gradient
 from ..lanes.row_numbers import RowNumbers
 from ..numerics.angles import turned
-from ..numerics.checks import choice, fail, flag, integer, positive_real, real, trailing
+from ..numerics.checks import choice, fail, flag, integer, positive_real, trailing
 from ..numerics.default_device import device_of, on
 from ..signs import Sign
 from .compiled_filter import Forecast, forecasts, log_density
@@ -32,7 +32,6 @@ from .tuning import CENTERS, Tuning, tuned_streams, tuning
 _log = logging.getLogger(__name__)
 _NAME = "StaFRegressor"
 _EXPLAINED = 0.5  # of the variance: a ball of 2.3 widths of the Gaussian kernel
-_PLAIN = 64  # rounding errors of the covariance: less noise than that would leave no digit of it
 
 
 class StaFRegressor(StreamEstimator):
@@ -320,45 +319,32 @@ class StaFRegressor(StreamEstimator):
         scaling, found = flag(_NAME, "scaling", self.scaling), self._tuned(streams, outputs, like)
         kernel, numbers = _kernel(self.kernel), {name: getattr(self, name) for name in NAMES}
         refuse_gradient(_NAME, **numbers)
-        if found is None and has_rows(numbers, kernel):
-            own = own_law(_NAME, numbers, dtype, streams, like)
-            filter_ = _own_filter(own, own_functions(_NAME, kernel.to(like.device), own["radius"], toward))
-            self.centers_offsets_ = own["radius"][:, None, None] * toward
-            state = StreamState.empty(like, streams, dim, len(toward), outputs)
-            return FilterStreams(filter_, state, scaling, periodic=angles)
-        robust = math.inf if self.robust is None else positive_real(_NAME, "robust", single(self.robust))
         if found is not None:
+            robust = math.inf if self.robust is None else positive_real(_NAME, "robust", single(self.robust))
             self.centers_offsets_ = found.radius[0] * toward
             return tuned_streams(found, toward, dtype, robust, float(single(self.follow)), angles)
-        radius = positive_real(_NAME, "radius", single(self.radius))
-        law = torch.tensor(self._law(dtype), dtype=torch.float64, device=like.device)
-        follow = real(_NAME, "follow", single(self.follow))
-        if follow < 0:
-            raise fail(_NAME, "follow", "must not be negative", self.follow)
-        self.centers_offsets_ = offsets = radius * toward
-        kernel = kernel.to(like.device)
-        if kernel.core(torch.zeros_like(offsets[0]), offsets, offsets).dim() != 2:
-            raise fail(_NAME, "kernel", "must have one value a hyperparameter for all streams", self.kernel)
-        functions = LocalFunctions.of(kernel, offsets)
-        _check_reach(functions, radius)
-        ratio, forgetting = law.unsqueeze(1).repeat(1, streams)
-        base = float(single(self.amplitude)) ** 2
-        filter_ = LocalFilter(functions, ratio, forgetting, follow * radius, robust, base)
-        state = StreamState.empty(like, streams, dim, len(offsets), outputs)
+        rows, kernel = has_rows(numbers, kernel), kernel.to(like.device)
+        count, where = (streams, like) if rows else (1, torch.empty(0, device="cpu"))
+        law = own_law(_NAME, numbers, dtype, count, where)
+        self.centers_offsets_ = offsets = law["radius"][:, None, None].to(toward) * toward
+        if rows:
+            filter_ = _own_filter(law, own_functions(_NAME, kernel, law["radius"], toward))
+        else:
+            self.centers_offsets_ = offsets = offsets[0]
+            if kernel.core(torch.zeros_like(offsets[0]), offsets, offsets).dim() != 2:
+                rule = "must have one value a hyperparameter for all streams"
+                raise fail(_NAME, "kernel", rule, self.kernel)
+            one = {name: float(value) for name, value in law.items()}
+            functions, base = LocalFunctions.of(kernel, offsets), one["amplitude"] ** 2
+            _check_reach(functions, one["radius"])
+            ratio, forgetting = (
+                like.new_full((streams,), value, dtype=torch.float64)
+                for value in ((one["noise"] / one["amplitude"]) ** 2, one["forgetting"])
+            )
+            slack = one["follow"] * one["radius"]
+            filter_ = LocalFilter(functions, ratio, forgetting, slack, one["robust"], base)
+        state = StreamState.empty(like, streams, dim, len(toward), outputs)
         return FilterStreams(filter_, state, scaling, periodic=angles)
-
-    def _law(self, dtype: torch.dtype) -> tuple[float, float]:
-        """Return the checked variance of the noise in units of the process's, and the forgetting."""
-        noise = positive_real(_NAME, "noise", single(self.noise))
-        ratio = (noise / positive_real(_NAME, "amplitude", single(self.amplitude))) ** 2
-        precision = torch.finfo(dtype).eps
-        if ratio < _PLAIN * precision:
-            rule = f"must be at least {math.sqrt(_PLAIN * precision):.1e} amplitude in {dtype}"
-            raise fail(_NAME, "noise", rule, self.noise)
-        forgetting = real(_NAME, "forgetting", single(self.forgetting))
-        if not 0 < forgetting <= 1:
-            raise fail(_NAME, "forgetting", "must be in (0, 1]", self.forgetting)
-        return ratio, forgetting
 
     def _directions(self, dim: int, where: torch.device) -> Tensor:
         """Return the centers' directions, (M, n), on a device."""
