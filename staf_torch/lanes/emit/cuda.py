@@ -175,13 +175,11 @@ class _CudaWriter(ScalarWriter, TableWriter):
 
     def _buffer(self, op: str, place: int, j: int, at: str = "0") -> str:
         slot, entry = self._slot(op, place)
-        name, single = self._names[op][slot], self._size(op, slot) == 1
+        name, starts = self._names[op][slot], self._starts[op]
+        single = starts[slot + 1] - starts[slot] == 1
         index = f"{entry}" if at == "0" else f"({entry} + {at})" if entry else f"({at})"
         step = "" if single or index == "0" else f" + {index} * {name}_entry"
         return self._read_as_real(f"__ldg({name}{step})", self._dtype(op, slot))
-
-    def _size(self, op: str, slot: int) -> int:
-        return {"row": self.layout.rows, "now": self.layout.nows, "state": self.layout.carries}[op][slot]
 
     def _dtype(self, op: str, slot: int) -> torch.dtype:
         held = self._dtypes

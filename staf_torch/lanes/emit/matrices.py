@@ -121,9 +121,8 @@ class MatrixWriter(StatementWriter):
                 with self._braces(f"for (int q = 1; q < {count}; ++q)"):
                     for r, j in every:
                         name = f"r{r}{self._copy(j)}"
-                        self._line(
-                            f"{name} = {rounded(self._fma(*self._factors(node, indices, r, 'q', j), name))};"
-                        )
+                        a, b = self._factors(node, indices, r, "q", j)
+                        self._line(f"{name} = {rounded(self._fma(a, b, name))};")
                 for r, j in every:
                     self._line(f"a{node}[(p + {r}) * {self.copies} + {j}] = r{r}{self._copy(j)};")
 

@@ -21,12 +21,6 @@ from ..trace.graph import FIXED, IN_PLACE, NOW, REAL, ROW, STEP, Graph
 class Schedule:
     """The computation of a program, block by block.
 
-    Args:
-        graph: the nodes.
-        following: the carry after a step.
-        outputs: what a step puts out.
-        ahead: whether what times alone decide is found before the steps.
-
     Attributes:
         carries: the numbers of every loop's carry that something needs.
         live: the nodes that something needs.
@@ -112,12 +106,7 @@ class Schedule:
         return self._where[one] == self._where[other]
 
     def repeats(self, node: int, *, skipped: int = 1) -> int:
-        """Return how often a step computes a node: the product of the counts of the loops around it.
-
-        Args:
-            node: that something needs.
-            skipped: one in how many passes counts of a loop whose passes a row may not take.
-        """
+        """Return how often a step computes a node: the product of the counts of the loops around it."""
         count, owner = 1, self._owner.get(node)
         while owner is not None:
             loop = self._graph.loops[owner]
@@ -315,13 +304,6 @@ def ends_with(
 
     Nothing else reads it, and of the carry it reads at most the same entry of the same slot. None where no
     map is like that.
-
-    Args:
-        graph: the nodes.
-        schedule: of the same program.
-        taken: maps that are computed where they are read.
-        slot: of the carry, in memory.
-        nodes: what it becomes.
     """
     first = nodes[0]
     node = graph.args[first][0] if graph.op[first] == "elem" else first

@@ -52,15 +52,7 @@ _ARRAYS = ("pack", "map", "dot", *IN_PLACE, "collect", "carrys", "results")
 
 
 class StatementWriter(abc.ABC):
-    """Writes the statements of blocks and loops; a back end says how numbers are read and operations spelt.
-
-    Args:
-        graph: the nodes.
-        schedule: where each is computed.
-        layout: of inputs and outputs.
-        types: how the types of nodes are spelt.
-        copies: independent copies of every variable that advance side by side.
-    """
+    """Writes statements of blocks and loops; a back end says how numbers are read and operations spelt."""
 
     _infix: ClassVar[dict[str, str]] = _INFIX
     _prefix: ClassVar[dict[str, str]] = {"copy": "", "neg": "-"}

@@ -108,7 +108,6 @@ def first_row() -> bool:
 
 
 _log = logging.getLogger(__name__)
-Some = TypeVar("Some")
 _TRUTH = frozenset([Tensor.__bool__, Tensor.is_nonzero, torch.is_nonzero])
 _COMPARED = frozenset([torch.equal, Tensor.equal, torch.allclose, Tensor.allclose])
 _OPAQUE = frozenset([Tensor.numpy, Tensor.__array__, Tensor.__contains__, Tensor.__dlpack__, Tensor.data_ptr])
@@ -134,11 +133,7 @@ class DecidedByRows:
 
 
 class _SplitError(BaseException):
-    """The signal that rows decide differently.
-
-    Args:
-        holds: (R,) bool, what each of them decided.
-    """
+    """The signal that rows decide differently."""
 
     def __init__(self, holds: Tensor) -> None:
         super().__init__()
@@ -286,11 +281,7 @@ def _together(function: Callable[[], Any], count: int, rows: Tensor) -> Alike:
 
 
 class _Decisions(TorchFunctionMode):
-    """Context in which a value is read of all rows: that on which they agree.
-
-    Args:
-        level: of the `vmap` over the rows.
-    """
+    """Context in which a value is read of all rows: that on which they agree."""
 
     def __init__(self, level: int) -> None:
         super().__init__()

@@ -72,12 +72,6 @@ def whichever(kind: Tensor, bodies: Sequence[Callable[[Any], Any]], given: Any, 
 def by_kind(kind: Tensor, methods: Sequence[Callable[[Tensor], Tensor]], x: Tensor, like: Tensor) -> Tensor:
     """Return `whichever` of a batch, (B, ..., n) to (B, ...); a method is called once, for all of its rows.
 
-    Args:
-        kind: of every row, numbers of rows.
-        methods: of every kind.
-        x: (B, ..., n).
-        like: a tensor of the result's shape.
-
     Raises:
         ValueError: if the numbers are of another count of rows.
     """

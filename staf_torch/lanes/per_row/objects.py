@@ -80,11 +80,6 @@ def rows(numbers: Tensor | Sequence[nn.Module]) -> Any:
 def refuse_rows(call: str, instead: str = "make one for each row", **given: Any) -> None:
     """Refuse objects with numbers of a row's own, of a door that does not serve them.
 
-    Args:
-        call: the door.
-        instead: what to do.
-        given: its arguments by name.
-
     Raises:
         ValueError: that names the first one.
     """

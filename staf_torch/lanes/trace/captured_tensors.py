@@ -59,10 +59,6 @@ class Recipe(NamedTuple):
 class TableSlopes:
     """Slopes by captured tensors, of those by the numbers of a table that follow from them.
 
-    Args:
-        recipe: of the table.
-        of: found tensors.
-
     Attributes:
         runs: of the numbers: where each begins, and its length.
     """

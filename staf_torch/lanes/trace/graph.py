@@ -83,9 +83,6 @@ class Graph:
 
     What is simplified is exact in every bit, infinities, NaN and signed zeros included: constants, x * 1,
     x / 1, x - 0, x + (-0), -(-x), choices between equals.
-
-    Args:
-        single: whether the program's float is float32.
     """
 
     def __init__(self, single: bool) -> None:

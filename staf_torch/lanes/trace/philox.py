@@ -117,7 +117,8 @@ def _numbers(halves: Sequence[Tensor], block: Tensor, second: bool) -> Tensor:
     none = torch.zeros_like(place)
     counter, chosen = (step, place, none, none), slice(2 * second, 2 * second + 2)
     one, other = words(counter, key)[chosen]
-    return ((one << 21) + (other >> 11) - 2**52).to(low.dtype) * 2.0**-52
+    found: Tensor = ((one << 21) + (other >> 11) - 2**52).to(low.dtype) * 2.0**-52
+    return found
 
 
 _LIBRARY = torch.library.Library("staf_torch", "FRAGMENT")

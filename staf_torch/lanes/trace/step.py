@@ -116,13 +116,7 @@ def trace(
 
 
 class _OwnNumbers:
-    """Numbers of `rows(...)` that a step has read, in order: inputs that follow those of the row.
-
-    Args:
-        tracer: of the step.
-        first: how many inputs of a row there are before.
-        folded: whether the program cannot hold them.
-    """
+    """Numbers of `rows(...)` that a step has read, in order: inputs that follow those of the row."""
 
     def __init__(self, tracer: Tracer, first: int, folded: bool) -> None:
         self._tracer, self._first, self._folded = tracer, first, folded

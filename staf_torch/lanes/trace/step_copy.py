@@ -107,14 +107,7 @@ class StepCopy:
     def body(
         self, number: int, here: int, carry: Sequence[int], *, back: bool
     ) -> tuple[list[int], list[list[int]]]:
-        """Copy a pass; return what follows, and what is collected.
-
-        Args:
-            number: of the loop in the step.
-            here: the loop that stays, or which pass.
-            carry: before it.
-            back: whether passes are taken from the last to the first.
-        """
+        """Copy a pass; return what follows, and what is collected."""
         loop = self._of.loops[number]
         self._pass[number] = here, back
         self._known[loop.depth] = dict(zip(loop.carry, carry, strict=True))
@@ -122,13 +115,7 @@ class StepCopy:
         return [*map(self._at, loop.following)], [[*map(self._at, part)] for part in loop.collected]
 
     def held(self, number: int, here: int, nodes: Iterable[int]) -> dict[int, int]:
-        """Return what stands for numbers of a pass that a loop has kept, or that follow from such.
-
-        Args:
-            number: of the loop in the step.
-            here: the loop that takes the passes in reverse.
-            nodes: of its pass.
-        """
+        """Return what stands for numbers of a pass that a loop has kept, or that follow from such."""
         loop, before, known = self._of.loops[number], self._last[number], self._known
         found = dict[int, int]()
         for part, node in enumerate(self._held[number], len(loop.collected)):

@@ -67,10 +67,6 @@ _INSTEAD: dict[str, str] = {
 class NotLoweredError(Exception):
     """A program that cannot be compiled: the operation, the line of user code that asked for it, and what to
     write in its place.
-
-    Args:
-        reason: names the operation.
-        name: of it among those for which something else can be written.
     """
 
     def __init__(self, reason: str, name: str = "") -> None:
@@ -110,12 +106,6 @@ class Tracer(TorchDispatchMode):
 
     Views need no rule: they see the nodes of the storage that they look at. What does not depend on an input
     is a constant and is not written down. Derivatives arrive here as ordinary operations.
-
-    Args:
-        graph: written.
-        lower: the nodes of what an operation returns, `step.lower`.
-        widened: whether the numbers of a float32 program are carried in double.
-        folded: whether the numbers of captured tensors become part of the text.
     """
 
     def __init__(self, graph: Graph, lower: Callable[..., Any], *, widened: bool, folded: bool) -> None:
@@ -192,13 +182,7 @@ class Tracer(TorchDispatchMode):
         return _of_each(function, _broadcast(arrays))
 
     def map(self, op: str, *arrays: Ids, least: int = LARGE) -> Ids:
-        """An operation of every entry of arrays that broadcast: scalar by scalar, or a loop over many.
-
-        Args:
-            op: of single numbers.
-            arrays: of nodes.
-            least: entries above which it is a loop.
-        """
+        """An operation of every entry of arrays that broadcast: scalar by scalar, or a loop over many."""
         graph = self.graph
         spread = _broadcast(arrays)
         if spread[0].size > least and not self._folds(spread):
