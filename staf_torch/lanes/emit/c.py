@@ -370,8 +370,8 @@ _MATH = """acos acosh asin asinh atan atan2 atanh cbrt ceil copysign cos cosh er
     pow10 sincos scalb"""
 _MACROS = """NAN INFINITY HUGE_VAL NULL EOF I complex imaginary assert errno noreturn stdin stdout stderr
     signbit isfinite isinf isnan isnormal fpclassify M_E M_PI M_PI_2 M_PI_4 M_SQRT2"""
-_LIBRARY = """main abs labs div exit abort calloc clock free malloc memcpy memset printf puts raise rand realloc
-    remove rename scanf signal size_t sprintf srand strlen system time"""
+_LIBRARY = """main abs labs div exit abort calloc clock free malloc memcpy memset printf puts raise rand
+    realloc remove rename scanf signal size_t sprintf srand strlen system time"""
 _WORDS = {**dict.fromkeys(_CPP.split(), "a word of C++"), **dict.fromkeys(_C.split(), "a word of C")}
 _WORDS |= dict.fromkeys(_MACROS.split(), "a name of the C library")
 _FUNCTIONS = {name + end: "a function of math.h" for name in _MATH.split() for end in ("", "f", "l")}

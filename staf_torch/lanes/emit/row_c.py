@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from ..calls.inputs import Given
 from ..dependencies.contents import Contents, leads_by_copies, told_copies
 from ..dependencies.walk import BOUND, EMPTY, Derived, content_of
-from ..trace.captured_tensors import Recipe, tensors
+from ..trace.captured_tensors import Recipe, address_of, places_of, tensors
 from ..trace.decompositions import MOVEMENTS
 from ..trace.graph import WIDE
 from ..trace.step import Step, Traced, trace
@@ -142,7 +142,7 @@ def kept(recipe: Recipe, real: torch.dtype) -> list[Tensor]:
         exact = _exact(function, args, kwargs, out) and _small([*given, *tensors(out)], real)
         (read if exact else folded).update(_united(known, given))
     folded |= _united(known, [tensor for tensor, _ in recipe.checks])
-    addresses = [tensor.untyped_storage().data_ptr() for tensor in recipe.found]
+    addresses = [*map(address_of, recipe.found)]
     alone = [
         tensor
         for tensor, address in zip(recipe.found, addresses, strict=True)
@@ -182,7 +182,7 @@ def named_tensors(roots: Mapping[str, Any]) -> dict[int, tuple[str, Tensor]]:
     while waiting:
         name, value = waiting.pop(0)
         if isinstance(value, Tensor):
-            found.setdefault(_address(value), (_FREE.sub("?", name), value))
+            found.setdefault(address_of(value), (_FREE.sub("?", name), value))
         elif id(value) not in met:
             met.add(id(value))
             waiting += _parts(name, value)
@@ -196,10 +196,10 @@ def said(recipe: Recipe, known: Mapping[int, tuple[str, Tensor]]) -> list[str]:
 
     def origins(tensor: Tensor) -> set[int]:
         """The memory of the found tensors that one follows from."""
-        return {_address(found[key]) for key in ends.get(id(tensor), ()) if key in found}
+        return {address_of(found[key]) for key in ends.get(id(tensor), ()) if key in found}
 
     def named(tensor: Tensor) -> bool:
-        return _address(tensor) in known or id(tensor) not in made
+        return address_of(tensor) in known or id(tensor) not in made
 
     led = set[int]().union(*(origins(tensor) for tensor, _ in recipe.reads if not named(tensor)))
     asked = set[int]().union(*(origins(tensor) for tensor, _ in recipe.checks))
@@ -209,10 +209,10 @@ def said(recipe: Recipe, known: Mapping[int, tuple[str, Tensor]]) -> list[str]:
             names = [known[address][0] for address in origins(tensor) if address in known]
             told += [f"follows from {_some(names)}"] * len(at)
             continue
-        name, whole = known.get(_address(tensor), ("without a name", tensor))
-        more = _LED * (_address(tensor) in led) + _ASKED * (_address(tensor) in asked)
-        index = {place: k for k, place in enumerate(_places(whole).reshape(-1).tolist())}
-        places = _places(tensor).reshape(-1)[at].tolist()
+        name, whole = known.get(address_of(tensor), ("without a name", tensor))
+        more = _LED * (address_of(tensor) in led) + _ASKED * (address_of(tensor) in asked)
+        index = {place: k for k, place in enumerate(places_of(whole).reshape(-1).tolist())}
+        places = places_of(tensor).reshape(-1)[at].tolist()
         told += [_entry(name, whole, index.get(place)) + more for place in places]
     return told
 
@@ -227,18 +227,6 @@ def _entry(name: str, whole: Tensor, place: int | None) -> str:
     if whole.dim() == 0 or place is None:
         return name
     return f"{name}[{', '.join(map(str, np.unravel_index(place, tuple(whole.shape))))}]"
-
-
-def _places(tensor: Tensor) -> np.ndarray[Any, Any]:
-    """Return the places in memory of the entries."""
-    at = np.full(tuple(tensor.shape), int(tensor.storage_offset()), dtype=np.int64)
-    for axis, (size, stride) in enumerate(zip(tensor.shape, tensor.stride(), strict=True)):
-        at += (np.arange(size) * stride).reshape([-1] + [1] * (tensor.dim() - axis - 1))
-    return at
-
-
-def _address(tensor: Tensor) -> int:
-    return tensor.untyped_storage().data_ptr()
 
 
 def _parts(name: str, value: Any) -> Iterator[tuple[str, Any]]:

@@ -171,12 +171,12 @@ class Captured:
         """Return whether the numbers of a tensor are part of the text."""
         if not _in_memory(tensor):
             return True
-        _, stated = self._made.get(_address(tensor), (None, not tensor.is_floating_point()))
+        _, stated = self._made.get(address_of(tensor), (None, not tensor.is_floating_point()))
         return stated
 
     def from_outside(self, tensor: Tensor) -> bool:
         """Return whether a tensor existed before the trace."""
-        return _in_memory(tensor) and _address(tensor) not in self._made
+        return _in_memory(tensor) and address_of(tensor) not in self._made
 
     def ran(self, function: Any, args: Sequence[Any], kwargs: dict[str, Any], out: Any) -> None:
         """Note an operation on tensors of which no row has its own."""
@@ -191,15 +191,15 @@ class Captured:
             elif not tensors(out):  # read in a way that cannot be checked
                 self._repeats = False
             self._operations.append((function, args, kwargs, out))
-            self._used.update(map(_address, given))
+            self._used.update(map(address_of, given))
         if function._schema.is_mutable:
             for tensor in given:
                 self._forget(tensor)
             # What was read before would be read as it is written now.
-            self._repeats = self._repeats and stated and self._used.isdisjoint(map(_address, given))
-        before = set(map(_address, given))
+            self._repeats = self._repeats and stated and self._used.isdisjoint(map(address_of, given))
+        before = set(map(address_of, given))
         for tensor in filter(_in_memory, tensors(out)):
-            address, storage = _address(tensor), tensor.untyped_storage()
+            address, storage = address_of(tensor), tensor.untyped_storage()
             known = address in self._made
             if not stated:
                 self._made[address] = storage, False
@@ -222,22 +222,17 @@ class Captured:
 
     def numbers(self, tensor: Tensor, kind: str, new: Callable[[int], int]) -> np.ndarray[Any, Any]:
         """The nodes of a tensor's entries, one for every place in memory."""
-        strides = tensor.stride()
-        at = np.full(tensor.shape, 0, dtype=np.int64)
-        for axis, (size, stride) in enumerate(zip(tensor.shape, strides, strict=True)):
-            at += (np.arange(size) * stride).reshape([-1] + [1] * (tensor.dim() - axis - 1))
-        start = int(tensor.storage_offset())
         places = self._places.setdefault((self._first(tensor), kind), {})
-        flat, fresh = at.reshape(-1).tolist(), []
+        flat, fresh = places_of(tensor).reshape(-1).tolist(), []
         for index, place in enumerate(flat):
-            if start + place not in places:
-                places[start + place] = new(self.count)
+            if place not in places:
+                places[place] = new(self.count)
                 self.count += 1
                 fresh.append(index)
         if fresh:
             self._reads.append((tensor, np.array(fresh)))
             self._values.append(_read(tensor, self._reads[-1][1]))
-        nodes = np.array([places[start + place] for place in flat], dtype=np.int64)
+        nodes = np.array([places[place] for place in flat], dtype=np.int64)
         return nodes.reshape(tensor.shape)
 
     def recipe(self) -> Recipe:
@@ -260,11 +255,11 @@ class Captured:
         return Recipe(_joined(self._values), operations, self._reads, numbers, self._checks)
 
     def _made_inside(self, tensor: Tensor) -> bool:
-        return not _in_memory(tensor) or self._made.get(_address(tensor), (None, False))[1]
+        return not _in_memory(tensor) or self._made.get(address_of(tensor), (None, False))[1]
 
     def _forget(self, tensor: Tensor) -> None:
         """New numbers stand in this memory."""
-        address = _address(tensor)
+        address = address_of(tensor)
         for key in [key for key in self._places if key[0] == address]:
             del self._places[key]
         self._results = {key: result for key, result in self._results.items() if result != address}
@@ -272,7 +267,7 @@ class Captured:
 
     def _first(self, tensor: Tensor) -> int:
         """The storage of a tensor, or the earlier one that holds the same numbers."""
-        return self._same.get(_address(tensor), _address(tensor))
+        return self._same.get(address_of(tensor), address_of(tensor))
 
     def _recognise(self, address: int, function: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> None:
         """Let what an operation returned be what it returned before, of the same arguments.
@@ -316,6 +311,14 @@ def tensors(value: Any) -> list[Tensor]:
     return found
 
 
+def places_of(tensor: Tensor) -> np.ndarray[Any, Any]:
+    """The places in memory of the entries."""
+    at = np.full(tuple(tensor.shape), int(tensor.storage_offset()), dtype=np.int64)
+    for axis, (size, stride) in enumerate(zip(tensor.shape, tensor.stride(), strict=True)):
+        at += (np.arange(size) * stride).reshape([-1] + [1] * (tensor.dim() - axis - 1))
+    return at
+
+
 def _read(tensor: Tensor, at: np.ndarray[Any, Any]) -> Tensor:
     with _disable_current_modes():  # the tracer itself among them
         return tensor.detach().double().reshape(-1)[at].cpu()
@@ -325,7 +328,7 @@ def _joined(parts: Sequence[Tensor]) -> Tensor:
     return torch.cat(list(parts)) if parts else torch.zeros(0, dtype=torch.float64, device="cpu")
 
 
-def _address(tensor: Tensor) -> int:
+def address_of(tensor: Tensor) -> int:
     return tensor.untyped_storage().data_ptr()
 
 

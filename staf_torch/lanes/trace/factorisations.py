@@ -55,7 +55,7 @@ def _cholesky_by_columns(gram: Tensor) -> tuple[Tensor, Tensor]:
 def _cholesky_in_place(gram: Tensor, tracer: Tracer, kind: str) -> tuple[Tensor, Tensor]:
     with _disable_current_modes():
         factor, failed = torch.linalg.cholesky_ex(gram.detach())
-    found = tracer.cholesky(tracer.nodes(gram, kind).reshape(-1), gram.shape[-1], kind)
+    found = tracer.on_matrix("cholesky", tracer.nodes(gram, kind).reshape(gram.shape[-2:]), kind)
     tracer.attach(factor, found[:-1].reshape(factor.shape))
     return factor, tracer.attach(torch.empty_like(factor[..., 0, 0]), found[-1].reshape(failed.shape))
 
@@ -86,8 +86,9 @@ def _triangular_in_place(lower: Tensor, right: Tensor, unit: bool, tracer: Trace
         given = lower.detach(), right.detach()
         known = torch.linalg.solve_triangular(*given, upper=False, unitriangular=unit).contiguous()
     sides = [tracer.nodes(part, kind).reshape(part.shape[-2:]) for part in (lower, right)]
-    found = tracer.substitute(np.concatenate(sides, axis=1), kind, unit)
-    return tracer.attach(known, found.reshape(known.shape))
+    rows = np.concatenate(sides, axis=1)
+    found = tracer.on_matrix("substitute_unit" if unit else "substitute", rows, kind)
+    return tracer.attach(known, found.reshape(rows.shape)[:, len(rows) :].reshape(known.shape))
 
 
 def cholesky_solve(right: Tensor, factor: Tensor, upper: bool = False) -> Tensor:
@@ -399,7 +400,7 @@ def _in_memory(gram: Tensor) -> tuple[list[Tensor], list[Tensor], Tensor]:
     kind, size = tracer.kind(gram.dtype), gram.shape[-1]
     held = REAL if kind == NARROW else kind
     nodes = tracer.nodes(gram, held)
-    every = [tracer.tridiagonal(each, size, held) for each in nodes.reshape(-1, size * size)]
+    every = [tracer.on_matrix("tridiagonal", each, held) for each in nodes.reshape(-1, size, size)]
     found = tracer.cast(np.stack(every).reshape(values.shape), kind)
     *parts, last = tracer.attach(values, found).unbind(-1)
     return parts[:size], parts[size:], last[..., None, None]

@@ -235,24 +235,16 @@ class Tracer(TorchDispatchMode):
         array = self.graph.add("dot", (a, b), kind, (outs, shape[-1], at, by))
         return self.entries(array, kind, outs).reshape(shape[:-1])
 
-    def tridiagonal(self, flat: Ids, size: int, kind: str) -> Ids:
-        """Return diagonal and squares beside it of a symmetric matrix over its largest |entry|, and that."""
-        array, places = self.array(flat, kind)
-        aux = ("copy", (size, size), tuple(places.tolist()))
-        return self.entries(self.graph.add("tridiagonal", (array,), kind, aux), kind, 2 * size)
+    def on_matrix(self, op: str, rows: Ids, kind: str) -> Ids:
+        """Return the entries of what an operation of `graph.IN_PLACE` makes of a matrix.
 
-    def cholesky(self, flat: Ids, size: int, kind: str) -> Ids:
-        """Return L, row by row, of a matrix K = L L', and 0 or the place of a pivot that is not positive."""
-        array, places = self.array(flat, kind)
-        aux = ("copy", (size, size), tuple(places.tolist()))
-        return self.entries(self.graph.add("cholesky", (array,), kind, aux), kind, size * size + 1)
-
-    def substitute(self, rows: Ids, kind: str, unit: bool) -> Ids:
-        """Return T^-1 B of (T B), a lower triangle and what is beside it: (M, M + P) -> (M, P)."""
+        Of "tridiagonal": the diagonal and the squares beside it, over the largest |entry|, and that; of
+        "cholesky": L, row by row, and 0 or the place of a pivot that is not positive; of "substitute" of
+        (T B), a lower triangle and what is beside it: (T T^-1 B).
+        """
         array, places = self.array(rows.reshape(-1), kind)
-        aux = ("copy", rows.shape, tuple(places.tolist()))
-        node = self.graph.add("substitute_unit" if unit else "substitute", (array,), kind, aux)
-        return self.entries(node, kind, rows.size).reshape(rows.shape)[:, len(rows) :]
+        node = self.graph.add(op, (array,), kind, ("copy", rows.shape, tuple(places.tolist())))
+        return self.entries(node, kind, self.graph.size(node))
 
     def _folds(self, arrays: Sequence[Ids]) -> bool:
         op = self.graph.op
