@@ -33,14 +33,6 @@ class StreamEstimator(ScikitEstimator, abc.ABC):
 
     Threads may share one: any number of them predict at once, a sample is learned while nobody does, and
     `fit` takes the place of what was learned when it has ended.
-
-    Attributes:
-        n_features_in_: n, from the first sample on.
-        n_streams_: S, or None for a single stream without batch dimension.
-        n_outputs_: K, or None for y without a dimension of its own.
-        n_samples_seen_: samples that each stream has learned from, () or (S,).
-        n_skipped_: samples that were not learned, () or (S,): without a target, with all of x NaN or a
-            coordinate that was never measured, not finite, or out of proportion.
     """
 
     __slots__ = ("_lock",)  # no part of what a copy or scikit-learn sees of an estimator

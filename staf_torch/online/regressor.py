@@ -84,7 +84,8 @@ class StaFRegressor(StreamEstimator):
         n_outputs_: K, or None for y without a dimension of its own.
         centers_offsets_: d, (M, n).
         n_samples_seen_: samples that each stream has learned from, () or (S,).
-        n_skipped_: samples that were not learned, () or (S,).
+        n_skipped_: samples that were not learned, () or (S,): without a target, with all of x NaN or a
+            coordinate that was never measured, not finite, or out of proportion.
 
     Source: Rosenfeld et al., section 2, for the centers; Kalman (1960) and, for the exactness of a Gaussian
     process given its values at inducing points, Snelson and Ghahramani (2006).
@@ -324,7 +325,7 @@ class StaFRegressor(StreamEstimator):
             self.centers_offsets_ = found.radius[0] * toward
             return tuned_streams(found, toward, dtype, robust, float(single(self.follow)), angles)
         rows, kernel = has_rows(numbers, kernel), kernel.to(like.device)
-        count, where = (streams, like) if rows else (1, torch.empty(0, device="cpu"))
+        count, where = (streams, like) if rows else (1, torch.empty(0, dtype=torch.float64, device="cpu"))
         law = own_law(_NAME, numbers, dtype, count, where)
         self.centers_offsets_ = offsets = law["radius"][:, None, None].to(toward) * toward
         if rows:

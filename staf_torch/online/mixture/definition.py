@@ -359,20 +359,14 @@ class BankDefinition:
         return float(s["waiting_lapse"]) + lapse
 
     def _notice(self, s: Views, y: Tensor, measured: Tensor) -> None:
-        """The range of y, of outputs that are measured now or have been before."""
+        """The range, running mean and spread of y, of outputs that are measured now or have been before."""
         known = measured | (s["low"] < torch.inf)
         torch.minimum(s["low"], torch.where(known, y, torch.inf), out=s["low"])
         torch.maximum(s["high"], torch.where(known, y, -torch.inf), out=s["high"])
         s["last_y"].copy_(torch.where(known, y, s["last_y"]))
-        self._learn_spread(s, y, known)
-
-    def _learn_spread(self, s: Views, y: Tensor, known: Tensor) -> None:
-        """The running mean and spread of y, as the filter's."""
-        spread = torch.where(constant(s), 1.0, s["wide"])
-        level, wide, leaps, told = spread_with(
-            y, s["level"], s["wide"], spread, s["leaps"], s["told"], s["clock"]
-        )
-        for name, new in (("level", level), ("wide", wide), ("leaps", leaps), ("told", told)):
+        spread, running = torch.where(constant(s), 1.0, s["wide"]), ("level", "wide", "leaps", "told")
+        found = spread_with(y, s["level"], s["wide"], spread, s["leaps"], s["told"], s["clock"])
+        for name, new in zip(running, found, strict=True):
             s[name].copy_(torch.where(known, new, s[name]))
 
     def _accept(self, s: Views, x: Tensor, y: Tensor, time: float, lapse: float, anew: bool = False) -> None:
