@@ -353,12 +353,8 @@ class LoopProgram:
     it is undone, random numbers too, and the compiled program runs the loop. Else plain torch goes on, and
     says in the log after 1.5 s how long the rest takes, if more than 3 s.
 
-    Args:
-        plain: the program in plain torch.
-        compiled: makes the compiled one; None where there is none.
-        times: of the loop, all calls together.
-        remedy: what makes it faster, for the log.
-        parts: of the loop, of whose classes other programs would be.
+    ``times`` are those of all calls together, ``remedy`` says in the log what makes it faster, and other
+    ``parts`` are other loops.
     """
 
     def __init__(

@@ -63,11 +63,7 @@ def defer_gradient(call: str, **given: Any) -> tuple[Tensor, ...]:
     """Refuse as `refuse_gradient`, but for a tensor that follows from others, as in a loop of which a
     gradient is wanted, refuse the backward pass and not the call.
 
-    Args:
-        call, given: as there.
-
-    Returns:
-        The tensors and the parameters of layers that require one, for `marked`.
+    Returns the tensors and the parameters of layers that require one, for `marked`.
     """
     if not torch.is_grad_enabled():
         return ()
@@ -93,10 +89,8 @@ def gradients_of(call: str, **given: Any) -> tuple[Tensor, ...]:
 def marked(call: str, layers: Sequence[Tensor], result: _R) -> _R:
     """Return a tree of results that refuse the backward pass to parameters of layers, where any require one.
 
-    Args:
-        call: that computed the results without gradients, for the message.
-        layers: as `refuse_gradient` returned them.
-        result: tensors, nested tuples, lists and dictionaries of them, or a dataclass of these.
+    ``call`` is named by the message, ``layers`` are what `refuse_gradient` returned, ``result`` is a tree of
+    tensors, or a dataclass of these.
     """
     wanted = [part for part in layers if part.requires_grad] if layers and torch.is_grad_enabled() else []
     if not wanted:
@@ -113,9 +107,7 @@ def marked(call: str, layers: Sequence[Tensor], result: _R) -> _R:
 def without_gradient(call: str, *names: str) -> Callable[[Callable[_P, _R]], Callable[_P, _R]]:
     """Decorate a function that runs without autograd: it refuses arguments that require a gradient.
 
-    Args:
-        call: the function, for the message.
-        names: of the arguments that are looked at.
+    ``call`` is named by the message, ``names`` are those of the arguments that are looked at.
     """
 
     def decorated(function: Callable[_P, _R]) -> Callable[_P, _R]:
@@ -296,11 +288,8 @@ def backward(
 ) -> tuple[Tensor, ...]:
     """Return the slopes by some tensors of those that depend on them: 0 where none does.
 
-    Args:
-        ends: that depend.
-        at: with ``requires_grad``.
-        slopes: of ``ends``, of their shapes and dtypes; None for one number, of which the graph is not kept.
-        create_graph: whether the result is differentiated again.
+    Without ``slopes``, that are of the shapes and dtypes of ``ends``, these are one number, of which the
+    graph is not kept.
     """
     given: Sequence[Tensor | None] = [None] * len(ends) if slopes is None else slopes
     pairs = [(end, slope) for end, slope in zip(ends, given, strict=True) if end.requires_grad]

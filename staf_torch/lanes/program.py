@@ -103,9 +103,8 @@ class Program(Derived):
     def described(self, by: bytes | None, tensors: Sequence[Tensor]) -> None:
         """Let traces go through the user's cache; whoever describes a step looks for changes himself.
 
-        Args:
-            by: tells steps apart, in any process, that differ in more than tensors; None where nothing does.
-            tensors: all floating-point tensors that the step reads.
+        ``by`` tells steps apart, in any process, that differ in more than ``tensors``, all floating-point
+        ones that the step reads; None where nothing does.
         """
         self._described, self._tensors = None if by is None else (by, tensors), tensors
         self._of_users, self._watched = (None if by is None else False), False

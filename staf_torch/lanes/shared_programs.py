@@ -47,10 +47,6 @@ class SharedPrograms:
     A step that differs from another in floating-point tensors alone takes over its text, and nothing is
     traced or compiled. Where all code that it runs is of this library or of torch, the trace also comes from
     the user's cache, where earlier processes left it.
-
-    Args:
-        name: of the programs, in the log.
-        most: programs that are kept.
     """
 
     def __init__(self, name: str, most: int = 64) -> None:

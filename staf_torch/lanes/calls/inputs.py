@@ -107,12 +107,8 @@ class one_precision:  # noqa: N801
 
     `torch.autocast` changes nothing within, or a result would hang on whether code had been built before.
 
-    Args:
-        name: of what was called, for the error.
-        inputs: trees of tensors.
-
-    Raises:
-        ValueError: in place of torch's error on two dtypes, where it reads a network or tensor of another.
+    It raises ValueError in place of torch's error on two dtypes, where it reads a network or tensor of
+    another.
     """
 
     def __init__(self, name: str, *inputs: Tree) -> None:

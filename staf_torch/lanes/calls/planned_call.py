@@ -283,10 +283,8 @@ def strides_of(leaf: Any, timed: bool, lies: bool = True) -> tuple[tuple[int, in
     """The strides of an input from row to row, from time to time and from entry to entry, how many entries
     there are, and whether it is read where it lies: if not, these are those of a contiguous copy.
 
-    Args:
-        leaf: a tensor or a `Shared` one.
-        timed: whether a dimension of times comes first (after the rows).
-        lies: whether it may be read where it lies if its entries lie equally far apart, in their order.
+    Where ``timed`` a dimension of times comes first (after the rows); where ``lies``, it is read where it
+    lies if its entries lie equally far apart, in their order.
     """
     shared, tensor = type(leaf) is Shared, plain(leaf)
     lead = 1 + timed - shared

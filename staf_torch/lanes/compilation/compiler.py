@@ -198,13 +198,8 @@ def seconds() -> float:
 def run(command: list[str], *, short: bool = True, folder: Path | None = None) -> str:
     """Return what a compiler prints.
 
-    Args:
-        command: program and arguments.
-        short: whether it takes seconds at most. One that does not end is not called again by this process.
-        folder: where it runs.
-
-    Raises:
-        OSError: if it fails, or does not end in time.
+    A ``short`` one takes seconds at most; if it does not end, this process does not call it again. It raises
+    OSError if it fails or does not end in time.
     """
     if command[0] in _hanging:
         raise OSError(f"{command[0]} did not end before")

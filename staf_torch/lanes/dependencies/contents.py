@@ -298,12 +298,8 @@ def leads_by_copies(read: Contents, parts: tuple[Any, ...]) -> bool:
 class _Copies:
     """Copies of objects that hold told floats, and of all that leads to them.
 
-    Args:
-        told: of `Contents`.
-
-    Attributes:
-        replaced: addresses of the objects that were copied with tensors.
-        others: what was not looked into.
+    ``replaced`` are addresses of the objects that were copied with tensors, ``others`` what was not looked
+    into.
     """
 
     def __init__(self, told: Told) -> None:

@@ -49,11 +49,7 @@ class LoadedKernel(ctypes.c_void_p):
 
 
 class CudaDevice:
-    """A CUDA device.
-
-    Args:
-        index: as torch counts them.
-    """
+    """A CUDA device."""
 
     def __init__(self, index: int) -> None:
         self.index = index
@@ -188,11 +184,7 @@ def _digest(*parts: str) -> str:
 
 
 class Nvrtc:
-    """NVIDIA's compiler as a library.
-
-    Args:
-        path: of it, or a name that the system finds.
-    """
+    """NVIDIA's compiler as a library."""
 
     def __init__(self, path: str) -> None:
         if os.path.isabs(path):  # it opens another by its bare name, which must be there by then
@@ -296,13 +288,8 @@ def best(text: str, compiled: Callable[..., MachineCode], *, shared: bool = True
     registers it is taken with less of a thread's memory, or where nothing is spilled and it is little more;
     with shared memory, which the cache of a thread's memory then lacks, where nothing is spilled any more.
 
-    Args:
-        text: of the kernel.
-        compiled: compiles a text with options.
-        shared: whether the compiler can keep in shared memory what it spills.
-
-    Returns:
-        The machine code that is taken, and whether the first one spilled registers.
+    It returns the machine code that is taken, and whether the first one spilled registers; ``shared`` says
+    whether the compiler can keep in shared memory what it spills.
     """
     first = found = compiled(text)
     options: tuple[str, ...] = ()

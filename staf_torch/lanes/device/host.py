@@ -83,11 +83,10 @@ def recorded() -> Iterator[list[str]]:
         Shown by `tests/gpu.py`.
     """
     global _taken
-    before, texts = _taken, list[str]()
+    before, _taken = _taken, list[str]()
     try:
         with host():
-            _taken = texts
-            yield texts
+            yield _taken
     finally:
         _taken = before
 
@@ -111,11 +110,10 @@ def captured() -> Iterator[list[Callable[[], None]]]:
         Shown by `tests/lanes/test_device.py`.
     """
     global _launches
-    before, launches = _launches, list[Callable[[], None]]()
+    before, _launches = _launches, list[Callable[[], None]]()
     try:
         with host():
-            _launches = launches
-            yield launches
+            yield _launches
     finally:
         _launches = before
 
