@@ -275,7 +275,10 @@ REFUSED: list[tuple[Callable[[], Any], str]] = [
     (lambda: regressed(forgetting="no"), "`StaFRegressor(forgetting=...)` must be a number"),
     (lambda: mixed(memory=3), "`MixtureRegressor(memory=...)` must be at least"),
     (lambda: theory.drift_constants(BASIS, PAPER, THREE, THREE), "`drift_constants(states=...)` must have 2"),
-    (lambda: systems.Bounds("no", None, 1), "`Bounds(low=...)` must be a number or one an input"),
+    (
+        lambda: systems.Bounds("no", None, 1),
+        "`Bounds(low=...)` must be a number or one for each of the 1 inputs",
+    ),
     (lambda: systems.Linear([[0.0]], [[1.0], [1.0]]), "must have 1 rows, one a state"),
     (lambda: adp.QuadraticCost(1.0, 1.0, 2, 1, discount=-1.0), "(discount=...)` must not be neg"),
     (

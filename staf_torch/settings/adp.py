@@ -21,7 +21,7 @@ from ..adp.safety.box_filter import walls
 from ..approximation.basis import StaFBasis
 from ..numerics.checks import COMMAND_LINE, choice, fail, flag, integer, positive_real
 from ..systems import ControlAffineSystem, Plant
-from ..systems.barrier import wall_numbers
+from ..systems.base import limit_of_each
 from . import config_directory
 from .chase import initial_states, make, make_centers, make_system, placement, plain, seed_of
 
@@ -145,8 +145,8 @@ def controller(cfg: DictConfig, system: Plant, cost: Cost) -> Controller:
 def _behind_walls(cfg: DictConfig, system: Plant, control: Controller, dt: float) -> Controller:
     """The controller behind a `SafetyFilter` that keeps the box of `adp.walls`; itself without walls."""
     given, size = plain(cfg.adp.walls), system.dim or 0
-    low = wall_numbers("adp.walls", "low", given["low"], -math.inf, size)
-    high = wall_numbers("adp.walls", "high", given["high"], math.inf, size)
+    low = limit_of_each("adp.walls", "low", given["low"], -math.inf, size, "states")
+    high = limit_of_each("adp.walls", "high", given["high"], math.inf, size, "states")
     kept = walls(low.tolist(), high.tolist())
     return adp.SafetyFilter(control, system, kept, dt=dt, decay=given["decay"]) if kept else control
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import ClassVar
 
 import torch
@@ -11,10 +10,8 @@ from torch import Tensor
 
 from ..lanes.per_row.objects import by_rows
 from ..numerics.angles import wrap
-from ..numerics.checks import fail, fails, hold, numbers_of, states
-from .base import ControlAffineSystem, Linearisation, Units
-
-Wall = float | Sequence[float | None] | Tensor | None
+from ..numerics.checks import fail, fails, hold, states
+from .base import ControlAffineSystem, Limit, Linearisation, Units, limit_of_each
 
 
 class Barrier(ControlAffineSystem):
@@ -57,13 +54,13 @@ class Barrier(ControlAffineSystem):
         ("coordinates", "transform", "inverse", "margin", "stretch", "walls"), (1,)
     )
 
-    def __init__(self, plant: ControlAffineSystem, low: Wall, high: Wall) -> None:
+    def __init__(self, plant: ControlAffineSystem, low: Limit, high: Limit) -> None:
         if not isinstance(plant, ControlAffineSystem) or plant.dim is None:
             raise fail("Barrier", "plant", "must be a ControlAffineSystem with `dim`", plant)
         super().__init__()
         center = plant.equilibrium().double()
-        lows = wall_numbers("Barrier", "low", low, -math.inf, plant.dim).to(center)
-        highs = wall_numbers("Barrier", "high", high, math.inf, plant.dim).to(center)
+        lows = limit_of_each("Barrier", "low", low, -math.inf, plant.dim, "states").to(center)
+        highs = limit_of_each("Barrier", "high", high, math.inf, plant.dim, "states").to(center)
         sides = ("low", lows, lows >= center, "below"), ("high", highs, highs <= center, "above")
         for name, wall, wrong, side in sides:
             if bool(wrong.any()):
@@ -208,17 +205,3 @@ class Barrier(ControlAffineSystem):
         return torch.where(
             self.free.to(apart.device), apart, torch.where((down > 0) & (up > 0), s, torch.nan)
         )
-
-
-def wall_numbers(call: str, name: str, given: Wall, none: float, size: int) -> Tensor:
-    """Return a wall for each coordinate, (n,) float64."""
-    numbers = numbers_of(call, name, given)
-    every = [numbers] * size if numbers is None or isinstance(numbers, int | float) else numbers
-    if isinstance(every, str) or not isinstance(every, Sequence) or len(every) != size:
-        raise fail(call, name, f"must be a number or one for each of the {size} states", given)
-    walls = [none if one is None else one for one in every]
-    if not all(isinstance(one, int | float) and not isinstance(one, bool) for one in walls):
-        raise fail(call, name, "must be numbers or None", given)
-    if any(math.isnan(one) or one == -none for one in walls):
-        raise fail(call, name, f"must be finite or {none}", given)
-    return torch.tensor(walls, dtype=torch.float64, device="cpu")

@@ -21,7 +21,7 @@ from ..numerics.default_device import device_of
 from ..numerics.derivatives import point_jacobian
 from ..numerics.repr_text import limits, settings, sizes
 
-Limit = float | Sequence[float] | Tensor | None
+Limit = float | Sequence[float | None] | Tensor | None
 _HERE = torch.empty(0, dtype=torch.float64, device="cpu")
 Number = float | Tensor
 """A number, as a tensor without dimensions one of a table, or by `staf_torch.rows` one a row."""
@@ -47,8 +47,8 @@ class Bounds:
 
     def __init__(self, low: Limit, high: Limit, inputs: int) -> None:
         # Not a module: a class of plants may have its bounds as a class attribute.
-        self.low = _limit("low", low, -math.inf, inputs)  # (m,)
-        self.high = _limit("high", high, math.inf, inputs)  # (m,)
+        self.low = limit_of_each("Bounds", "low", low, -math.inf, inputs, "inputs")  # (m,)
+        self.high = limit_of_each("Bounds", "high", high, math.inf, inputs, "inputs")  # (m,)
         if not bool((self.low < self.high).all()):
             raise fail("Bounds", "low", f"must be below high, {self.high.tolist()}", self.low.tolist())
 
@@ -83,24 +83,23 @@ class Bounds:
         return f"Bounds(low={low}, high={high})"
 
 
-def _limit(name: str, given: Limit, none: float, inputs: int) -> Tensor:
-    if given is None:
-        given = none
-    if isinstance(given, bool) or not isinstance(given, int | float | Sequence | Tensor):
-        raise fail("Bounds", name, "must be a number or one an input", given)
+def limit_of_each(call: str, name: str, given: Limit, none: float, count: int, what: str) -> Tensor:
+    """Return a limit for each of so many inputs or states, (count,) float64; ``none`` is -inf or inf."""
+    rule = f"must be a number or one for each of the {count} {what}"
     if isinstance(given, Tensor):
-        check_shared("Bounds", name, given)
-    refuse_gradient("Bounds", **{name: given})
-    try:
-        limit = torch.as_tensor(given, dtype=torch.float64, device="cpu").detach()
-    except (TypeError, ValueError) as error:
-        raise fail("Bounds", name, "must be a number or one an input", given) from error
-    if limit.dim() == 0:
-        limit = limit.repeat(inputs)
-    if limit.shape != (inputs,):
-        raise fail("Bounds", name, f"must be a number or one for each of the {inputs} inputs", given)
+        check_shared(call, name, given)
+    refuse_gradient(call, **{name: given})
+    if isinstance(given, Sequence) and not isinstance(given, str):
+        given = [none if one is None else one for one in given]
+    entries = given if isinstance(given, list) else [none if given is None else given]
+    if any(isinstance(one, bool) or not isinstance(one, int | float | Tensor) for one in entries):
+        raise fail(call, name, rule, given)
+    limit = torch.as_tensor(none if given is None else given, dtype=torch.float64, device="cpu").detach()
+    limit = limit.repeat(count) if limit.dim() == 0 else limit
+    if limit.shape != (count,):
+        raise fail(call, name, rule, given)
     if bool(torch.isnan(limit).any()) or bool((limit == -none).any()):
-        raise fail("Bounds", name, f"must be finite or {none}", given)
+        raise fail(call, name, f"must be finite or {none}", given)
     return limit
 
 

@@ -100,7 +100,8 @@ def trajectory(
             x = torch.where(strained.unsqueeze(-1), torch.nan, after)
             yield torch.where(strained[:, None, None], torch.nan, piece)
             continue
-        if _calm(bent, reach):
+        # By one number no row is strained, surely; NaN in any says nothing.
+        if len(bent) and bool(torch.add(bent, reach, alpha=-BENT).amax() <= 0):
             x = after
             yield piece
             continue
@@ -113,11 +114,6 @@ def trajectory(
             after, piece = _refined(system, dt, x, after, piece, strained.nonzero().squeeze(1))
         x = after
         yield piece
-
-
-def _calm(bent: Tensor, reach: Tensor) -> bool:
-    """Return whether surely no row is strained, by one number; NaN in any says nothing."""
-    return len(bent) > 0 and bool(torch.add(bent, reach, alpha=-BENT).amax() <= 0)
 
 
 Tracked = tuple[Tensor, Tensor, Tensor]
