@@ -3,7 +3,7 @@
 LAPACK exchanges rows where a pivot asks for it. Rows in lanes have pivots of their own, so nothing may
 branch on one: a row is chosen by comparing and selecting, and places are compared in place of exchanged. Up
 to `LARGE` entries an elimination is written out and lives in registers; above, Cholesky's and the one under
-a triangle are an operation of a program, in place. A solution by rows is a loop, in which a matrix moves on
+a triangle are an operation of a program, in place. Others are loops, in which a matrix moves on
 by a column after each pass, so that the text knows the first pivot alone. Eliminations by columns: Golub and
 Van Loan, Matrix Computations, ch. 3 to 5.
 
@@ -193,6 +193,8 @@ def solve_again(
 
 def orthogonal(matrix: Tensor, mode: str = "reduced") -> tuple[Tensor, Tensor]:
     """Q and R of a square matrix by Householder's reflections."""
+    if in_memory(matrix):
+        return _rolled_orthogonal(matrix)
     size = matrix.shape[-1]
     rest = matrix
     q = torch.eye(size, dtype=matrix.dtype, device=matrix.device).expand_as(matrix)
@@ -246,6 +248,30 @@ def log_determinant(matrix: Tensor) -> tuple[Tensor, Tensor]:
 def log_of_determinant(matrix: Tensor) -> Tensor:
     sign, size = log_determinant(matrix)
     return torch.where(sign < 0, torch.nan, size)
+
+
+def _rolled_orthogonal(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """Q and R of a square matrix by Householder's reflections: (..., M, M), (..., M, M)."""
+    size = matrix.shape[-1]
+    place = torch.arange(size, dtype=matrix.dtype, device=matrix.device)
+
+    def reflect(carry: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        rest, q, done = carry  # column i of the rest is column done + i, cyclically
+        here, open_ = place == done.unsqueeze(-1), place >= done.unsqueeze(-1)
+        column = torch.where(open_, rest[..., 0], 0.0)
+        length = column.square().sum(-1, keepdim=True).sqrt()
+        head = torch.where(column < 0, column - length, column + length)
+        vector = torch.where(here, head, column)
+        square = vector.square().sum(-1, keepdim=True)
+        scaled = torch.where(square > 0, 2 / torch.where(square > 0, square, 1.0), 0.0) * vector
+        rest = rest - scaled.unsqueeze(-1) * (vector.unsqueeze(-1) * rest).sum(-2, keepdim=True)
+        q = q - (q * vector.unsqueeze(-2)).sum(-1, keepdim=True) * scaled.unsqueeze(-2)
+        return torch.cat((rest[..., 1:], rest[..., :1]), dim=-1), q, done + 1
+
+    identity = torch.eye(size, dtype=matrix.dtype, device=matrix.device).expand_as(matrix)
+    start = matrix.clone(), identity.clone(), torch.zeros_like(matrix[..., 0, 0])
+    rest, q, _ = repeat(size - 1, reflect, start)
+    return q, torch.cat((rest[..., 1:], rest[..., :1]), dim=-1).triu()
 
 
 def _of_one(*matrices: Tensor) -> tuple[Tracer, str] | None:
