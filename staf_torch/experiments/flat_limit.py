@@ -15,6 +15,7 @@ from decimal import Decimal, localcontext
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from omegaconf import DictConfig
 from torch import Tensor
@@ -76,13 +77,15 @@ METHODS: dict[str, tuple[str, Method]] = {
 """By the prefix of the metrics: name for people, and method."""
 
 
-Point = list[Decimal]
+_EXACT = np.vectorize(Decimal, otypes=[object])  # of floats, to the exact numbers that they are
+_EXP = np.vectorize(Decimal.exp, otypes=[object])
 
 
-def paper(x: Point) -> Decimal:
-    """V(x) = x1^2 + 5 x2^2 + tanh(x1 x2), as `targets.Paper`."""
-    square = (2 * x[0] * x[1]).exp()
-    return x[0] * x[0] + 5 * x[1] * x[1] + (square - 1) / (square + 1)
+def paper(x: np.ndarray) -> np.ndarray:
+    """V(x) = x1^2 + 5 x2^2 + tanh(x1 x2), as `targets.Paper`, of decimals: (..., 2) -> (...)."""
+    square = _EXP(2 * x[..., 0] * x[..., 1])
+    value: np.ndarray = x[..., 0] ** 2 + 5 * x[..., 1] ** 2 + (square - 1) / (square + 1)
+    return value
 
 
 def interpolant(
@@ -91,7 +94,7 @@ def interpolant(
     """V^(x + r zeta) of the ideal weights for V of `paper`, by elimination on the textbook Gram matrix.
 
     Every float argument is taken as the exact number that it is. The condition number grows like
-    r^(-2 degree), and the digits with it.
+    r^(-2 degree), and the digits with it. A positive definite matrix needs no pivoting.
 
     Args:
         directions: u, (M, 2).
@@ -103,22 +106,26 @@ def interpolant(
     Returns:
         P numbers, to 30 digits or more.
     """
-    count = len(directions)
     with localcontext() as context:
-        context.prec = _digits(count, radius)
-        r, at = Decimal(radius), _exact(x)
-        offsets = [[r * e for e in _exact(u)] for u in directions]
-        points = [[r * e for e in _exact(z)] for z in zeta]
-        gram = [[_core(d, e, width) for e in offsets] for d in offsets]
-        samples = [
-            paper([p + q for p, q in zip(at, d, strict=True)]) * _scale(at, d, width, -1) for d in offsets
-        ]
-        b = _solve(gram, samples)
-        return [
-            _scale(at, z, width, 1)
-            * sum((_core(z, d, width) * c for d, c in zip(offsets, b, strict=True)), Decimal(0))
-            for z in points
-        ]
+        context.prec = _digits(len(directions), radius)
+        at, u, z = (_EXACT(each.double().numpy()) for each in (x, directions, zeta))
+        d, z = Decimal(radius) * u, Decimal(radius) * z
+        rate = Decimal(1) if width is None else 1 / Decimal(width) ** 2
+
+        def scale(z: np.ndarray, sign: int) -> np.ndarray:
+            """e^{sign s(x, z)}, s = x'z or -|z|^2 / (2 width^2)."""
+            s = z @ at if width is None else -rate * (z * z).sum(-1) / 2
+            factors: np.ndarray = _EXP(sign * s)
+            return factors
+
+        samples = paper(at + d) * scale(d, -1)
+        rows = np.concatenate([_EXP(rate * d @ d.T), samples[:, None]], axis=1)  # of k0(z, d) = exp(rate z'd)
+        for k in range(len(d)):
+            rows[k] = rows[k] / rows[k, k]
+            others = np.arange(len(d)) != k
+            rows[others] -= rows[others, k, None] * rows[k]
+        found: list[Decimal] = (scale(z, 1) * (_EXP(rate * z @ d.T) @ rows[:, -1])).tolist()
+        return found
 
 
 def relative_error(found: Tensor, truth: Sequence[Decimal]) -> float:
@@ -134,42 +141,6 @@ def _digits(count: int, radius: float) -> int:
     by more than the layouts here do: (k + 1)(k + 2) / 2 >= M, and one degree to spare."""
     degree = math.ceil((math.sqrt(8 * count + 1) - 3) / 2) + 1
     return 50 + math.ceil(2 * degree * max(0.0, -math.log10(radius)))
-
-
-def _core(z: Point, d: Point, width: float | None) -> Decimal:
-    """k0(z, d) = exp(q z'd), q = 1 or 1 / width^2."""
-    rate = Decimal(1) if width is None else 1 / Decimal(width) ** 2
-    return (rate * _dot(z, d)).exp()
-
-
-def _scale(x: Point, z: Point, width: float | None, sign: int) -> Decimal:
-    """e^{sign s(x, z)}, s = x'z or -|z|^2 / (2 width^2)."""
-    s = _dot(x, z) if width is None else -_dot(z, z) / (2 * Decimal(width) ** 2)
-    return (sign * s).exp()
-
-
-def _solve(matrix: list[Point], right: Point) -> Point:
-    """Gaussian elimination of a positive definite matrix, which needs no pivoting."""
-    rows = [[*row, value] for row, value in zip(matrix, right, strict=True)]
-    size = len(rows)
-    for k in range(size):
-        for row in rows[k + 1 :]:
-            factor = row[k] / rows[k][k]
-            for j in range(k + 1, size + 1):
-                row[j] -= factor * rows[k][j]
-    solved = [Decimal(0)] * size
-    for k in reversed(range(size)):
-        known = sum((rows[k][j] * solved[j] for j in range(k + 1, size)), Decimal(0))
-        solved[k] = (rows[k][size] - known) / rows[k][k]
-    return solved
-
-
-def _exact(values: Tensor) -> Point:
-    return [Decimal(float(v)) for v in values]
-
-
-def _dot(a: Point, b: Point) -> Decimal:
-    return sum((p * q for p, q in zip(a, b, strict=True)), Decimal(0))
 
 
 class FlatLimit(NamedTuple):
