@@ -22,8 +22,8 @@ from torch import Tensor
 
 from ..approximation.basis import StaFBasis, Target
 from ..centers import StateFollowingCenters, probe_points, rings
+from ..figures.chase import ErrorPanel, draw_errors
 from ..figures.style import draws
-from ..figures.theory import ErrorPanel, draw_errors
 from ..kernels import ExponentialKernel, GaussianKernel, Kernel
 from ..local_basis import evaluate_scaled, newton_space
 from ..numerics.checks import COMMAND_LINE, fail, integer, positive_real

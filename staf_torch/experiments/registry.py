@@ -14,7 +14,7 @@ An experiment of your own needs no change here. Write a function or a class in a
 
 Then `staf --config-dir my_conf experiment=energy` runs the experiment and `staf -m --config-dir my_conf
 experiment=energy seed=0,1` sweeps it; `hydra.searchpath=[file://my_conf]` does what `--config-dir` does.
-`energy.held = ...`, a function of the settings, lets it have a dry run (`dry_run`).
+`energy.held = ...`, a function of the settings, lets it have a dry run (`study`).
 Derive a class from `BatchedExperiment` where many jobs can be computed as one tensor batch.
 """
 

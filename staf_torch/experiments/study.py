@@ -1,29 +1,41 @@
-"""The frame of a study: methods beside each other, of each a row, metrics and a line of the log."""
+"""The frame of a study: methods beside each other, of each a row, metrics and a log line; and dry runs.
+
+A dry run is a run on the meta device: settings become objects and shapes, nothing is computed, and the log
+says what a run would hold. Gains, designs and initial states, which are small and which numbers decide, are
+made on the CPU as everywhere. An experiment takes part by an attribute ``held``: a function of the settings
+that makes the histories of the rows, by the calls with which a run begins, and reads nothing of them.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import logging
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
 from ..figures.style import images
+from ..lanes.trace.tracer import explained
+from ..numerics.checks import COMMAND_LINE, fail
 from ..results.run_directory import Printable, RunDirectory
 from ..settings.chase import placement
+from ..signs import SHOWN, Progress
 from ..systems import Plant
 from ..tables import Style, Table
 from ..tables.model import significant
-from .registry import Metrics, finite
+from .registry import BatchedExperiment, Experiment, Metrics, Solution, experiment, finite
 
 if TYPE_CHECKING:  # `adp` is .1 s, which chases do not need
     from matplotlib.figure import Figure
 
     from ..adp import Controller, Cost, LoopResult
 
+_log = logging.getLogger(__name__)
 Drawing = Callable[[], "Figure"]
 _NAMED = 20  # diverged trajectories that the log lists by number
 
@@ -168,3 +180,61 @@ def log_diverged(log: logging.Logger, starts: Tensor | np.ndarray, at: Tensor, a
         log.warning("trajectory %d from %s diverged at t = %.6g s%s", row, start, float(at[row]), also)
     if len(rows) > _NAMED:
         log.warning("and %d more trajectories diverged", len(rows) - _NAMED)
+
+
+def experiment_of(settings: Mapping[str, Any] | DictConfig) -> Experiment | BatchedExperiment[Solution]:
+    """Return the experiment of a run: that of the setting `task`, or on the meta device its dry run.
+
+    Args:
+        settings: all of them, nested or with dotted keys.
+
+    Raises:
+        ValueError: as `experiment`, and for a dry run of an experiment that makes no histories.
+    """
+    study, device = experiment(settings["task"]), str(settings.get("device"))
+    if device.partition(":")[0] != "meta":
+        return study
+    held = getattr(study, "held", None)
+    if held is None:
+        rule = "in which numbers decide: it has no function `held` that makes its histories without them"
+        raise fail(
+            COMMAND_LINE, "device", f"must not be meta for the task {settings['task']}, {rule}", device
+        )
+    return DryRun(held)
+
+
+class DryRun:
+    """In place of an experiment on the meta device: log and write what its run would hold.
+
+    Args:
+        held: makes the histories of a run from its settings: name -> (B, T, ...).
+    """
+
+    def __init__(self, held: Callable[[DictConfig], Mapping[str, Tensor]]) -> None:
+        self._held = held
+
+    def __call__(self, cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
+        """Write shape, dtype and bytes of every history; the only metric is their sum, `history_bytes`.
+
+        Raises:
+            ValueError: if numbers decide on the way, with the line of code.
+        """
+        try:
+            with torch.no_grad():
+                held = self._held(cfg)
+        except RuntimeError as error:
+            if (instead := explained(error, f"staf device={cfg.device} task={cfg.task}")) is error:
+                raise
+            raise instead from error
+        columns = ("history", "shape", "dtype", "bytes")
+        rows: list[dict[str, Any]] = []
+        for name, x in held.items():
+            cells = name, " x ".join(map(str, x.shape)), str(x.dtype).removeprefix("torch."), x.nbytes
+            rows.append(dict(zip(columns, cells, strict=True)))
+        total, out = sum(x.nbytes for x in held.values()), RunDirectory(directory)
+        power = min(4, max(0, len(str(total)) - 1) // 3)
+        size = f"{total / 1000**power:.4g} {('B', 'kB', 'MB', 'GB', 'TB')[power]}"
+        told = f"the histories of a run take {size}" if rows else "a run keeps no histories"
+        heading = f"Dry run, nothing was computed: {told}"
+        report(out, _log, "dry_run", Table.of(rows, dict.fromkeys(columns, "")), None, heading=heading)
+        return out.metrics({"history_bytes": float(total)})

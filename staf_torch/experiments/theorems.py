@@ -15,8 +15,8 @@ from torch import Tensor
 
 from .. import theory
 from ..centers import ball, cross_polytope, polygon, rings, simplex
+from ..figures.chase import Feasibility, LayoutCurve, draw_exponential_bound, draw_feasibility, draw_layouts
 from ..figures.style import draws
-from ..figures.theory import Feasibility, LayoutCurve, draw_exponential_bound, draw_feasibility, draw_layouts
 from ..kernels import ExponentialKernel
 from ..numerics.checks import COMMAND_LINE, fail, integer, positive_real
 from ..results.run_directory import RunDirectory

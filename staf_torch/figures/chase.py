@@ -1,17 +1,29 @@
-"""Figures of the gradient chase, its laws, the experience memory, and a kernel learned by gradient."""
+"""Figures of the gradient chase, its laws, the memory, a learned kernel, the theorems, and the flat limit."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from .loop import by_unit
-from .style import against_time, colour, dash, decades, legend, letter, marker, named, panels, positive, ticks
+from .style import (
+    against_time,
+    at_left,
+    colour,
+    dash,
+    decades,
+    legend,
+    letter,
+    marker,
+    named,
+    panels,
+    positive,
+    ticks,
+)
 
 if TYPE_CHECKING:
-    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -69,40 +81,29 @@ def draw_chase(history: ChaseHistory) -> Figure:
             axes.set_ylabel(name)
             if len(entries) > 1:
                 legend(axes)
-        for axes, panel in zip(grid[len(states) :], (_values, _weights, _errors), strict=True):
-            panel(axes, history)
+        values, weights, errors = grid[len(states) :]
+        time = history.time
+        values.plot(time, history.value, color="0.7", linewidth=3.0, label="$V(x)$")
+        values.plot(time, history.estimate, "--", color=colour(0), label=r"$\hat V(x)$")
+        values.set_ylabel("value")
+        few = history.weights.shape[1] <= _NAMED
+        for i, column in enumerate(history.weights.T):
+            label = f"$a_{{{i + 1}}}$" if few else None if i else "weights $a$"
+            weights.plot(time, column, linestyle=dash(i), color=colour(i), label=label)
+        for i, ideal in enumerate(history.ideal_weights.T):
+            weights.plot(time, ideal, ":", color="0.2", linewidth=0.9, label=None if i else "ideal $w$")
+        weights.set_ylabel("weights")
+        error, floor = (np.abs(history.value - v) for v in (history.estimate, history.ideal_estimate))
+        errors.semilogy(time, positive(error), color=colour(0), label=r"$|V - \hat V|$")
+        errors.semilogy(time, positive(floor), "--", color="0.4", label="of ideal $w$")
+        errors.semilogy(time, positive(history.excess), "-.", color=colour(1), label="$F(a) - F(w)$")
+        decades(errors, _DECADES)
+        errors.set_ylabel("error at $x$; excess $F$")
+        for axes in (values, weights, errors):
             legend(axes)
         letter(grid)
         against_time(grid, history.time)
     return figure
-
-
-def _values(axes: Axes, history: ChaseHistory) -> None:
-    axes.plot(history.time, history.value, color="0.7", linewidth=3.0, label="$V(x)$")
-    axes.plot(history.time, history.estimate, "--", color=colour(0), label=r"$\hat V(x)$")
-    axes.set_ylabel("value")
-
-
-def _weights(axes: Axes, history: ChaseHistory) -> None:
-    count = history.weights.shape[1]
-    for i in range(count):
-        label = f"$a_{{{i + 1}}}$" if count <= _NAMED else None if i else "weights $a$"
-        axes.plot(history.time, history.weights[:, i], linestyle=dash(i), color=colour(i), label=label)
-    for i in range(count):
-        ideal = history.ideal_weights[:, i]
-        axes.plot(history.time, ideal, ":", color="0.2", linewidth=0.9, label=None if i else "ideal $w$")
-    axes.set_ylabel("weights")
-
-
-def _errors(axes: Axes, history: ChaseHistory) -> None:
-    error = np.abs(history.value - history.estimate)
-    floor = np.abs(history.value - history.ideal_estimate)
-    axes.semilogy(history.time, positive(error), color=colour(0), label=r"$|V - \hat V|$")
-    axes.semilogy(history.time, positive(floor), "--", color="0.4", label="of ideal $w$")
-    excess = positive(history.excess)
-    axes.semilogy(history.time, excess, "-.", color=colour(1), label="$F(a) - F(w)$")
-    decades(axes, _DECADES)
-    axes.set_ylabel("error at $x$; excess $F$")
 
 
 def draw_convergence(found: Sequence[ConvergenceCurve]) -> Figure:
@@ -123,56 +124,31 @@ def draw_convergence(found: Sequence[ConvergenceCurve]) -> Figure:
 
 def draw_memory(picture: MemoryPicture) -> Figure:
     """Draw the states of stored models, the error over the visited region, the excess after a revisit."""
-    with panels(3, 3, high=2.3) as (figure, grid):
-        for axes, panel in zip(grid, (_map, _region, _revisits), strict=True):
-            panel(axes, picture)
-        letter(grid)
-    return figure
-
-
-def _map(axes: Axes, picture: MemoryPicture) -> None:
-    """The first two states; a single one against itself."""
     from matplotlib.collections import EllipseCollection
 
-    second = 1 if picture.path.shape[1] > 1 else 0
-    axes.plot(picture.path[:, 0], picture.path[:, second], color="0.6", label="path")
-    points = picture.stored[:, [0, second]]
-    diameter = 2 * picture.radius
-    balls = EllipseCollection(
-        *(diameter, diameter, np.zeros_like(diameter)),
-        units="xy",
-        offsets=points,
-        transOffset=axes.transData,
-        facecolor="none",
-        edgecolor=colour(0),
-        linewidth=0.3,
-        alpha=0.5,
-    )
-    axes.add_collection(balls)
-    axes.plot(points[:, 0], points[:, 1], ".", color=colour(0), markersize=3, label="stored model")
-    legend(axes)
-    axes.margins(0.12)
-    axes.set_xlabel("$x_1$")
-    axes.set_ylabel(f"$x_{second + 1}$")
-    axes.set_aspect("equal", adjustable="datalim")
-
-
-def _region(axes: Axes, picture: MemoryPicture) -> None:
-    named(axes, picture.time, picture.errors, log=True)
-    legend(axes)
-    axes.set_xlabel("time of the visit (s)")
-    axes.set_ylabel(r"$\max\,|V - \hat V|$ on the ball")
-    axes.margins(x=0)
-
-
-def _revisits(axes: Axes, picture: MemoryPicture) -> None:
-    steps = len(next(iter(picture.excess.values())))
-    named(axes, np.arange(1, steps + 1), picture.excess, log=True)
-    axes.set_xscale("log")
-    axes.axhline(picture.settled, color="0.2", linestyle=":", linewidth=0.8, label="settled chase")
-    axes.set_xlabel("steps after the revisit")
-    axes.set_ylabel("largest excess")
-    legend(axes)
+    with panels(3, 3, high=2.3) as (figure, (plane, region, revisits)):
+        second = 1 if picture.path.shape[1] > 1 else 0  # a single state against itself
+        plane.plot(picture.path[:, 0], picture.path[:, second], color="0.6", label="path")
+        points, diameter = picture.stored[:, [0, second]], 2 * picture.radius
+        look: dict[str, Any] = {"facecolor": "none", "edgecolor": colour(0), "linewidth": 0.3, "alpha": 0.5}
+        where: dict[str, Any] = {"units": "xy", "offsets": points, "transOffset": plane.transData}
+        sizes = diameter, diameter, np.zeros_like(diameter)
+        plane.add_collection(EllipseCollection(*sizes, **where, **look))
+        plane.plot(points[:, 0], points[:, 1], ".", color=colour(0), markersize=3, label="stored model")
+        plane.margins(0.12)
+        plane.set(xlabel="$x_1$", ylabel=f"$x_{second + 1}$")
+        plane.set_aspect("equal", adjustable="datalim")
+        named(region, picture.time, picture.errors, log=True)
+        region.set(xlabel="time of the visit (s)", ylabel=r"$\max\,|V - \hat V|$ on the ball")
+        region.margins(x=0)
+        steps = len(next(iter(picture.excess.values())))
+        named(revisits, np.arange(1, steps + 1), picture.excess, log=True)
+        revisits.axhline(picture.settled, color="0.2", linestyle=":", linewidth=0.8, label="settled chase")
+        revisits.set(xscale="log", xlabel="steps after the revisit", ylabel="largest excess")
+        for axes in (plane, region, revisits):
+            legend(axes)
+        letter((plane, region, revisits))
+    return figure
 
 
 class LearnedKernel(NamedTuple):
@@ -188,58 +164,206 @@ class LearnedKernel(NamedTuple):
 
 def draw_learned_kernel(picture: LearnedKernel) -> Figure:
     """Draw the path over the errors of the grid, and the error over the steps."""
-    with panels(2, 2, high=2.6) as (figure, grid):
-        marks = _learned(figure, grid[0], picture)
-        _steps(grid[1], picture, marks)
-        letter(grid)
+    from matplotlib.colors import LogNorm
+
+    grid, radii, widths = picture.grid, picture.radii, picture.widths
+    best = int(np.nan_to_num(grid, nan=np.inf).argmin())
+    least = int(np.nan_to_num(picture.errors, nan=np.inf).argmin())
+    known = grid[np.isfinite(grid) & (grid > 0)]
+    norm = LogNorm(known.min(), known.max()) if known.size and known.max() > known.min() else None
+    with panels(2, 2, high=2.6) as (figure, (plane, steps)):
+        plane.set_facecolor("0.92")
+        image = plane.pcolormesh(widths, radii, grid, norm=norm, cmap="viridis", shading="nearest")
+        plane.set(xscale="log", yscale="log", xlabel=picture.name, ylabel="radius $r$ of the centers")
+        plane.grid(False)
+        plane.plot(*picture.path.T, ".-", color="white", markersize=2, linewidth=0.8)
+        row, column = np.unravel_index(best, grid.shape)
+        drawn = {
+            "start": (picture.path[0], "o", 5),
+            "best of the grid": ((widths[column], radii[row]), "s", 5),
+            "least of the way": (picture.path[least], "*", 9),
+        }
+        look: dict[str, Any] = {"color": "white", "markeredgecolor": "black", "linestyle": "none"}
+        marks = [
+            plane.plot(*at, kind, markersize=size, label=label, **look)[0]
+            for label, (at, kind, size) in drawn.items()
+        ]
+        for name, values in (("x", widths), ("y", radii)):
+            ticks(plane, name, [t for t in _ROUND if values[0] <= t <= values[-1]])
+        plane.minorticks_off()
+        figure.colorbar(image, ax=plane, label="error on the ball")
+        (line,) = steps.semilogy(picture.errors, color=colour(0), label="gradient")
+        floor = steps.axhline(grid.flat[best], color="0.2", linestyle=":", linewidth=0.8)
+        floor.set_label("least of the grid")
+        steps.set(xlabel="step of Adam", ylabel="root mean square error on the ball")
+        steps.margins(x=0)
+        legend(steps, handles=[line, floor, *marks])
+        letter((plane, steps))
     return figure
 
 
-def _learned(figure: Figure, axes: Axes, picture: LearnedKernel) -> list[Artist]:
-    """Draw the errors of the grid and the path; return its marks."""
-    from matplotlib.colors import LogNorm
-
-    known = picture.grid[np.isfinite(picture.grid) & (picture.grid > 0)]
-    norm = LogNorm(known.min(), known.max()) if known.size and known.max() > known.min() else None
-    axes.set_facecolor("0.92")
-    image = axes.pcolormesh(
-        *(picture.widths, picture.radii, picture.grid), norm=norm, cmap="viridis", shading="nearest"
-    )
-    axes.set(xscale="log", yscale="log", xlabel=picture.name, ylabel="radius $r$ of the centers")
-    axes.grid(False)
-    axes.plot(*picture.path.T, ".-", color="white", markersize=2, linewidth=0.8)
-    row, column = np.unravel_index(_least(picture.grid), picture.grid.shape)
-    drawn = {
-        "start": (picture.path[0], "o"),
-        "best of the grid": ((picture.widths[column], picture.radii[row]), "s"),
-        "least of the way": (picture.path[_least(picture.errors)], "*"),
-    }
-    marks: list[Artist] = []
-    for label, (at, kind) in drawn.items():
-        size = 9 if kind == "*" else 5
-        (mark,) = axes.plot(
-            *at, kind, color="white", markeredgecolor="black", markersize=size, linestyle="none", label=label
-        )
-        marks.append(mark)
-    for name, values in (("x", picture.widths), ("y", picture.radii)):
-        ticks(axes, name, [t for t in _ROUND if values[0] <= t <= values[-1]])
-    axes.minorticks_off()
-    figure.colorbar(image, ax=axes, label="error on the ball")
-    return marks
-
-
-def _least(errors: np.ndarray) -> int:
-    """The place of the least error that is known, the first where none is."""
-    return int(np.nan_to_num(errors, nan=np.inf).argmin())
-
-
-def _steps(axes: Axes, picture: LearnedKernel, marks: list[Artist]) -> None:
-    (line,) = axes.semilogy(picture.errors, color=colour(0), label="gradient")
-    best = picture.grid.flat[_least(picture.grid)]
-    floor = axes.axhline(best, color="0.2", linestyle=":", linewidth=0.8, label="least of the grid")
-    axes.set(xlabel="step of Adam", ylabel="root mean square error on the ball")
-    axes.margins(x=0)
-    legend(axes, handles=[line, floor, *marks])
-
-
 _ROUND = [m * 10.0**e for e in range(-6, 7) for m in (1, 2, 5)]
+_FAMILIES = ("rings", "ball", "polygon", "simplex", "cross_polytope")
+_SLOPES = 4  # layouts of a family: with more centers rounding takes over at small radii
+_BOUNDS = {
+    "count": "two polynomials (paper)",
+    "one_polynomial_count": "one polynomial",
+    "measured_count": "measured with ideal weights",
+}
+_METHODS = "osv^"  # markers, the later the smaller: curves that lie on each other are all seen
+_TOP = 12.0  # of the error axis of the flat limit: all digits are lost at 1
+_FAILED = 1.0  # where the marks of failures stand
+_FAILS, _DTYPE = "fails (in its colour)", r"$\varepsilon$ of the dtype"
+
+
+class Feasibility(NamedTuple):
+    """Numbers of centers that are needed: T states, R radii, E values of epsilon; 0 where no layout does."""
+
+    time: np.ndarray  # (T,) seconds
+    state: np.ndarray  # (T, n)
+    radius: float  # of `pointwise`
+    radii: np.ndarray  # (R,)
+    epsilons: np.ndarray  # (E,)
+    counts: np.ndarray  # (L,) of the layouts that were tried
+    pointwise: np.ndarray  # (E, T)
+    overall: np.ndarray  # (R, E)
+
+
+class LayoutCurve(NamedTuple):
+    """The error that a layout leaves on the ball."""
+
+    family: str
+    centers: int
+    order: int  # k + 1: the error is O(r^{k+1})
+    error: float  # at one radius
+    errors: np.ndarray  # (R,) at all radii
+    slope: float | None
+
+
+class ErrorPanel(NamedTuple):
+    """Relative errors of several methods in one dtype; inf where a method fails."""
+
+    title: str
+    rounding: float  # eps of the dtype
+    radius: Sequence[float]
+    error: Mapping[str, Sequence[float]]  # by the method's label, the most important one last
+
+
+def draw_exponential_bound(found: Mapping[tuple[float, float], Mapping[str, float | None]]) -> Figure:
+    """Number of kernels against epsilon, a panel a radius: both bounds and what is needed, by radius and
+    epsilon."""
+    radii, epsilons = (sorted(set(values)) for values in zip(*found, strict=True))
+    most = max(row[name] or 1 for row in found.values() for name in _BOUNDS)
+    with panels(len(radii), 3, sharex=True, sharey=True) as (figure, grid):
+        for axes, radius in zip(grid, radii, strict=True):
+            rows = {epsilon: row for (r, epsilon), row in found.items() if r == radius}
+            for i, (name, label) in enumerate(_BOUNDS.items()):
+                counts = np.array([row[name] for row in rows.values()], dtype=float)  # None: NaN
+                look = {"linestyle": dash(i), "color": colour(i), "marker": marker(i), "markersize": 4}
+                axes.loglog(list(rows), counts, label=label, **look)
+            axes.set_xlim(max(rows) * 1.5, min(rows) / 1.5)  # what is asked grows to the right
+            axes.set(title=f"$r = {radius:g}$", xlabel=r"largest error $\epsilon$")
+            axes.set_ylabel("kernels $M$" if at_left(axes) else "")
+        # Plain counts, and the values of epsilon that were computed; decades alone would be too few.
+        counted = (1, 2, 3, 6, 10, 20, 50, 100, 200, 500, 1000)
+        ticks(grid[0], "y", [count for count in counted if count <= most])
+        shown = epsilons[:: -(-len(epsilons) // 6)]
+        grid[0].set_xticks(shown, [f"${_power(epsilon)}$" for epsilon in shown])
+        grid[0].minorticks_off()
+        legend(*grid)
+    return figure
+
+
+def draw_feasibility(found: Feasibility) -> Figure:
+    """M that is needed along the trajectory at one radius, and for all of it against the radius."""
+    with panels(2, high=2.5, sharey=True) as (figure, (left, right)):
+        place, label = found.time, "time (s)"
+        norm = np.linalg.norm(found.state, axis=-1)
+        if found.state.shape[-1] == 2 and norm.max() < 1.01 * norm.min():  # an arc around the origin
+            angle = np.unwrap(np.arctan2(found.state[:, 1], found.state[:, 0]))
+            place, label = np.degrees(np.abs(angle - angle[0])), "angle passed on the circle (degrees)"
+        for i, epsilon in enumerate(found.epsilons):
+            style = {"color": colour(i), "linestyle": dash(i), "label": f"$\\epsilon = {_power(epsilon)}$"}
+            left.plot(place, positive(found.pointwise[i]), drawstyle="steps-mid", **style)
+            overall = positive(found.overall[:, i])
+            right.plot(found.radii, overall, marker=marker(i), markersize=4, **style)
+        left.set_yscale("log")
+        ticks(left, "y", found.counts)
+        left.set_ylabel("centers $M$")
+        right.set_ylabel("centers $M$" if at_left(right) else "")
+        left.set_xlabel(label)
+        left.margins(x=0)
+        right.set_xscale("log")
+        ticks(right, "x", found.radii)
+        right.set_xlabel("radius $r$ of the ball")
+        letter((left, right), f"at each state, $r = {found.radius:g}$", "along the whole trajectory")
+        legend(right, left)
+    return figure
+
+
+def draw_layouts(found: Sequence[LayoutCurve], radius: float, radii: np.ndarray) -> Figure:
+    """The error against M at one radius, and against the radius with measured slopes."""
+    with panels(2, high=3.0) as (figure, (left, right)):
+        for axes in (left, right):
+            axes.set(xscale="log", yscale="log")
+        families = {family: [curve for curve in found if curve.family == family] for family in _FAMILIES}
+        for i, (family, curves) in enumerate(families.items()):
+            if not curves:
+                continue
+            alone = len(curves) == 1  # a single point: an open marker, which hides none of the others
+            errors = positive(np.array([curve.error for curve in curves]))
+            (line,) = left.plot([curve.centers for curve in curves], errors, marker(i), color=colour(i))
+            line.set(linestyle="none" if alone else dash(i), label=family.replace("_", "-"))
+            line.set(markersize=8 if alone else 4, markerfacecolor="none" if alone else colour(i))
+        ticks(left, "x", sorted({c.centers for c in (*families["rings"], *families["ball"])}))
+        left.set(xlabel="centers $M$", ylabel=r"$\sup\,|V - \hat V|$ on the ball")
+        legend(left)
+        kept = families["rings"] or families["ball"]  # the one in the plane, the other elsewhere
+        for i, curve in enumerate([*kept[:_SLOPES], *families["polygon"][-1:]]):
+            slope = "-" if curve.slope is None else f"{curve.slope:.2f}"
+            (line,) = right.plot(radii, positive(curve.errors), marker(i), linestyle=dash(i), markersize=4)
+            line.set(color=colour(i), label=f"{curve.family}, {curve.centers}: {slope}")
+        ticks(right, "x", radii)
+        right.set_xlabel("radius $r$ of the ball")
+        legend(right, title="layout, $M$: slope")
+        right.set_ylabel(left.get_ylabel() if at_left(right) else "")
+        letter((left, right), f"$r = {radius:g}$", "slopes in $r$")
+    return figure
+
+
+def _power(number: float) -> str:
+    exponent = round(np.log10(number))
+    return f"10^{{{exponent}}}" if np.isclose(number, 10.0**exponent) else f"{number:g}"
+
+
+def draw_errors(panels_: Sequence[ErrorPanel], rows: int) -> Figure:
+    """Error against radius: panels in ``rows`` rows, log-log, each row with one error axis; one legend."""
+    failed = any(not np.isfinite(errors).all() for panel in panels_ for errors in panel.error.values())
+    labels = [*panels_[0].error, *([_FAILS] if failed else []), _DTYPE]
+    columns = len(panels_) // rows
+    with panels(len(panels_), columns, spare=labels, sharex=True) as (figure, grid):
+        for axes, panel in zip(grid, panels_, strict=True):
+            _errors(axes, panel)
+        letter(grid, *(panel.title for panel in panels_))
+        drawn = {str(line.get_label()): line for axes in grid for line in axes.get_lines()}
+        legend(*grid, handles=[drawn[label] for label in labels if label in drawn])
+    return figure
+
+
+def _errors(axes: Axes, panel: ErrorPanel) -> None:
+    radius = np.asarray(panel.radius)
+    for i, (label, errors) in enumerate(panel.error.items()):
+        error = np.asarray(errors)
+        # An exact result cannot stand on a log axis: it is drawn at a tenth of the rounding unit.
+        drawn = np.where(np.isfinite(error), np.maximum(error, 0.1 * panel.rounding), np.nan)
+        (line,) = axes.loglog(radius, drawn, linestyle=dash(i), color=colour(i), label=label)
+        line.set(marker=_METHODS[i], markersize=3.8 - 0.6 * i)
+        failed = radius[~np.isfinite(error)]
+        if len(failed):  # one row of marks a method, so that two that fail together are both seen
+            marks: dict[str, Any] = {"markersize": 3, "color": colour(i), "label": _FAILS}
+            axes.plot(failed, np.full(len(failed), _FAILED * 4.0**i), "x", linestyle="none", **marks)
+    floor = axes.axhline(panel.rounding, color="0.4", linewidth=0.8, linestyle=(0, (1, 1)))
+    floor.set_label(_DTYPE)
+    axes.set(ylim=(0.05 * panel.rounding, _TOP), xlabel="radius $r$")
+    axes.set_ylabel(r"relative error of $\hat V$" if at_left(axes) else "")
+    axes.margins(x=0.02)

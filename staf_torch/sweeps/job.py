@@ -24,7 +24,6 @@ from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from ..experiments.dry_run import experiment_of
 from ..experiments.registry import (
     BatchedExperiment,
     Experiment,
@@ -32,6 +31,7 @@ from ..experiments.registry import (
     Solution,
     check_animation,
 )
+from ..experiments.study import experiment_of
 from ..figures.style import FigurePaper, in_a_sweep, printed_on
 from ..lanes.compilation.compiler import compiler
 from ..numerics.checks import COMMAND_LINE, choice

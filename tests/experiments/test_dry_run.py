@@ -14,8 +14,8 @@ from composing import settings
 from helpers_experiments import run, words
 
 import staf_torch
-from staf_torch.experiments.dry_run import experiment_of
 from staf_torch.experiments.registry import experiment
+from staf_torch.experiments.study import experiment_of
 
 
 def dry(folder: Path, *overrides: str) -> dict[str, tuple[str, str]]:

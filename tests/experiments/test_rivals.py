@@ -14,8 +14,16 @@ from helpers_experiments import ran
 from torch import Tensor
 
 from staf_torch.experiments import rival_methods, rivals
-from staf_torch.experiments.rival_methods import METHODS, Begin, Rival, UnsuitableError, ipopt_program
-from staf_torch.experiments.rival_plants import CASES, RivalPlant, TorchMath
+from staf_torch.experiments.rival_methods import (
+    CASES,
+    METHODS,
+    Begin,
+    Rival,
+    RivalPlant,
+    TorchMath,
+    UnsuitableError,
+    ipopt_program,
+)
 
 SHORT = dataclasses.replace(CASES["double_integrator"], steps=60, horizon=20)
 

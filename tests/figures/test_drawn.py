@@ -21,7 +21,7 @@ from figures.drawing import (
 )
 from matplotlib.figure import Figure
 
-from staf_torch.figures import chase, closed_loop, sweep, theory
+from staf_torch.figures import chase, closed_loop, sweep
 from staf_torch.figures.animation import AnimationStage, Curves, Scene
 from staf_torch.figures.style import positive
 
@@ -115,8 +115,8 @@ def test_feasibility_is_drawn_along_the_arc_or_over_time(circle: bool) -> None:
     pointwise, overall = np.array([[3.0] * 8 + [0], [6.0] * 9]), np.array([[3.0, 6], [0, 10]])
     radii, epsilons = np.array([0.1, 0.5]), np.array([0.1, 0.003])
     counts = np.array([3, 6, 10])
-    found = theory.Feasibility(T, state, 0.5, radii, epsilons, counts, pointwise, overall)
-    figure = theory.draw_feasibility(found)
+    found = chase.Feasibility(T, state, 0.5, radii, epsilons, counts, pointwise, overall)
+    figure = chase.draw_feasibility(found)
     left, right = visible(figure)
     labels = "$\\epsilon = 10^{-1}$", "$\\epsilon = 0.003$"
     place = np.degrees(3.0 - angles) if circle else T
@@ -135,8 +135,8 @@ def test_feasibility_is_drawn_along_the_arc_or_over_time(circle: bool) -> None:
 def test_a_failure_is_a_mark_and_an_exact_result_a_tenth_of_rounding() -> None:
     radius = [0.1, 0.01, 0.001]
     errors = {"old": [0.5, np.inf, np.inf], "new": [0.1, 0.0, np.inf]}
-    panels = [theory.ErrorPanel(title, 1e-8, radius, errors) for title in ("float32", "float64")]
-    figure = theory.draw_errors(panels, 1)
+    panels = [chase.ErrorPanel(title, 1e-8, radius, errors) for title in ("float32", "float64")]
+    figure = chase.draw_errors(panels, 1)
     for n, axes in enumerate(visible(figure)):
         curves = [
             ("old", radius, [0.5, np.nan, np.nan]),
