@@ -1,5 +1,6 @@
-"""The plants and methods that are compared: one text of the equations for torch and CasADi, and each method from
-a plant and a cost to controls, as a user would write it."""
+"""The plants and methods that are compared: one text of the equations for torch and CasADi, and each method
+from a plant and a cost to controls, as a user would write it.
+"""
 
 from __future__ import annotations
 

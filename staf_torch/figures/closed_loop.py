@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-_CRITIC = (r"critic $\hat W_c$", r"$\hat W_{c,%d}$")  # of the axis, of a line
 _NAMED = 6  # curves of a panel that a legend tells apart
 _MARKED = 200  # times at most that are drawn with a marker each
 _LEAST_EXCESS, _MOST_EXCESS = 1e-4, 1e2  # of the cost over the optimum, in the comparison
@@ -70,47 +69,44 @@ def draw_adp(history: AdpHistory) -> Figure:
 
     Without weights the control takes their place; without a known optimum the errors are left out.
     """
-    n, m = history.state.shape[1], history.control.shape[1]
-    lines = _grouped("state $x$", "x", history.state_units or ("",) * n, history.state)
-    learned = bool(history.actor_weights.shape[1])
-    if learned:
-        for name, label, values in (
-            (r"actor $\hat W_a$", r"$\hat W_{a,%d}$", history.actor_weights),
-            (*_CRITIC, history.critic_weights),
-        ):
-            lines.append((name, values, [label % (i + 1) for i in range(values.shape[1])]))
-    else:
-        inputs = by_unit("control $u$", "u", history.input_units or ("",) * m)
-        lines += _grouped("control $u$", "u", history.input_units or ("",) * m, history.control)
+    time, weights = history.time, history.actor_weights.shape[1]
+    states = by_unit("state $x$", "x", history.state_units or ("",) * history.state.shape[1])
+    inputs = by_unit("control $u$", "u", history.input_units or ("",) * history.control.shape[1])
+    middle = [""] * 2 if weights else inputs  # the actor and the critic
     errors = {r"$|u - u^*|$": history.control_error, r"$|V^* - \hat V|$": history.value_error}
     known = {name: error for name, error in errors.items() if error is not None}
-    with panels(len(lines) + len(known) + 1) as (figure, grid):
-        titles = [""] * len(grid)
-        for axes, each in zip(grid, lines, strict=False):
-            _lines(axes, history.time, *each)
-        if not learned and len(history.low):
-            first = len(lines) - len(inputs)
-            for k, (_, entries) in enumerate(inputs, first):
-                titles[k] = bounds(grid[k], history.low[entries], history.high[entries])
-        for axes in grid[: len(lines)]:
+    with panels(len(states) + len(middle) + len(known) + 1) as (figure, grid):
+        titles, left = [""] * len(grid), iter(grid)
+        for name, entries in states:
+            _lines(next(left), time, name, history.state[:, entries], [f"$x_{{{i + 1}}}$" for i in entries])
+        if weights:
+            actor = [rf"$\hat W_{{a,{i + 1}}}$" for i in range(weights)]
+            _lines(next(left), time, r"actor $\hat W_a$", history.actor_weights, actor)
+            _critic(next(left), time, history.critic_weights)
+        else:
+            for k, (name, entries) in enumerate(inputs, len(states)):
+                names = [f"$u_{{{i + 1}}}$" for i in entries]
+                _lines(next(left), time, name, history.control[:, entries], names)
+                if len(history.low):
+                    titles[k] = bounds(grid[k], history.low[entries], history.high[entries])
+        for axes in grid[: len(states) + len(middle)]:
             if len(axes.get_legend_handles_labels()[0]) > 1:
                 legend(axes)
-        for axes, (name, error) in zip(grid[len(lines) :], known.items(), strict=False):
-            _logarithmic(axes, history.time, error, name)
-        _cost(grid[-1], history)
+        for name, error in known.items():
+            axes, at = next(left), np.isfinite(error)  # one found by shooting is known at some times alone
+            marked = "" if at.sum() > _MARKED else "."
+            axes.semilogy(time[at], positive(error[at]), color=colour(0), marker=marked, markersize=3)
+            decades(axes)
+            axes.set_ylabel(name)
+        cost = next(left)
+        cost.plot(time, history.running_cost, color=colour(0), label="so far")
+        if history.optimal_cost is not None:
+            cost.axhline(history.optimal_cost, color="0.4", linestyle="--", label="optimal, $V^*(x(0))$")
+            legend(cost)
+        cost.set(ylim=(min(0.0, cost.get_ylim()[0]), None), ylabel="cost")
         letter(grid, *titles)
-        against_time(grid, history.time)
+        against_time(grid, time)
     return figure
-
-
-def _grouped(
-    whole: str, letter: str, units: tuple[str, ...], values: np.ndarray
-) -> list[tuple[str, np.ndarray, list[str]]]:
-    """Name of an axis, its curves (T, k), and a name for each."""
-    return [
-        (name, values[:, entries], [f"${letter}_{{{i + 1}}}$" for i in entries])
-        for name, entries in by_unit(whole, letter, units)
-    ]
 
 
 def _lines(axes: Axes, time: np.ndarray, name: str, values: np.ndarray, labels: Sequence[str]) -> None:
@@ -120,21 +116,9 @@ def _lines(axes: Axes, time: np.ndarray, name: str, values: np.ndarray, labels: 
     axes.set_ylabel(name)
 
 
-def _logarithmic(axes: Axes, time: np.ndarray, values: np.ndarray, name: str) -> None:
-    known = np.isfinite(values)  # an optimum found by shooting is known at some of the times alone
-    marked = "" if known.sum() > _MARKED else "."
-    axes.semilogy(time[known], positive(values[known]), color=colour(0), marker=marked, markersize=3)
-    decades(axes)
-    axes.set_ylabel(name)
-
-
-def _cost(axes: Axes, history: AdpHistory) -> None:
-    axes.plot(history.time, history.running_cost, color=colour(0), label="so far")
-    if history.optimal_cost is not None:
-        axes.axhline(history.optimal_cost, color="0.4", linestyle="--", label="optimal, $V^*(x(0))$")
-        legend(axes)
-    axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
-    axes.set_ylabel("cost")
+def _critic(axes: Axes, time: np.ndarray, weights: np.ndarray) -> None:
+    labels = [rf"$\hat W_{{c,{i + 1}}}$" for i in range(weights.shape[1])]
+    _lines(axes, time, r"critic $\hat W_c$", weights, labels)
 
 
 def draw_comparison(ratios: Mapping[str, np.ndarray]) -> Figure:
@@ -178,28 +162,22 @@ def draw_initial_weights(weights: Sequence[float], found: Mapping[str, Sequence[
 def draw_tracking(history: TrackingHistory) -> Figure:
     """State against desired state, |e| of every variant, theta^ against theta, critic weights."""
     with panels(4) as (figure, grid):
-        _followed(grid[0], history)
+        for i in range(2):
+            desired = history.state[:, 2 + i]
+            look = {"linestyle": dash(i), "color": colour(i), "label": f"$x_{i + 1}$"}
+            grid[0].plot(history.time, history.state[:, i] + desired, **look)
+            grid[0].plot(history.time, desired, ":", color="0.2", label="desired" if i else None)
+        grid[0].set_ylabel("state")
         named(grid[1], history.time, history.errors, log=True)
         grid[1].set_ylabel("$|x - x_d|$")
         estimates(grid[2], history.time, history.parameters, history.truth)
         grid[2].set_ylabel(r"drift parameters $\hat\theta$")
-        name, label = _CRITIC
-        labels = [label % (i + 1) for i in range(history.critic_weights.shape[1])]
-        _lines(grid[3], history.time, name, history.critic_weights, labels)
+        _critic(grid[3], history.time, history.critic_weights)
         for axes in grid:
             legend(axes)
         letter(grid)
         against_time(grid, history.time)
     return figure
-
-
-def _followed(axes: Axes, history: TrackingHistory) -> None:
-    for i in range(2):
-        desired = history.state[:, 2 + i]
-        look = {"linestyle": dash(i), "color": colour(i), "label": f"$x_{i + 1}$"}
-        axes.plot(history.time, history.state[:, i] + desired, **look)
-        axes.plot(history.time, desired, ":", color="0.2", label="desired" if i else None)
-    axes.set_ylabel("state")
 
 
 _EARLY = 2.0  # s: what happens to the estimates later is not seen at the scale of the truth
@@ -223,7 +201,9 @@ def draw_faults(cases: Mapping[str, FaultPicture]) -> Figure:
             named(norms, case.time, case.norms, log=True)
             norms.set_ylabel("$|x|$")
             estimates(parameters, case.time, case.parameters, case.truth)
-            low, high = _frame(case)
+            low, high = float(case.truth.min()), float(case.truth.max())
+            room = 0.3 * max(high - low, 1.0)  # for how the estimates come in, and no excursion
+            low, high = low - room, high + room
             grey: dict[str, Any] = {"color": "0.88", "linewidth": 0, "zorder": 0, "label": "uncertain"}
             parameters.fill_between(case.time, low, high, where=~case.certain, **grey)
             against_time((norms, parameters), case.time)
@@ -234,13 +214,6 @@ def draw_faults(cases: Mapping[str, FaultPicture]) -> Figure:
         legend(*grid[::2])
         legend(*grid[1::2])
     return figure
-
-
-def _frame(case: FaultPicture) -> tuple[float, float]:
-    """Limits around the true parameters that show how the estimates come in, and no excursion."""
-    low, high = float(case.truth.min()), float(case.truth.max())
-    room = 0.3 * max(high - low, 1.0)
-    return low - room, high + room
 
 
 class GainSets(NamedTuple):
@@ -297,7 +270,13 @@ def draw_box(history: BoxHistory) -> Figure:
             plane.plot(path[:, 0], path[:, 1], linestyle=dash(i), color=colour(i), label=name)
         named(margin, history.time, history.margins)
         named(cost, history.time, history.costs)
-        walls(plane, history.low, history.high)
+        for k, ends in enumerate((plane.get_xlim(), plane.get_ylim())):  # walls, and what lies beyond
+            reach = 0.06 * (ends[1] - ends[0])
+            line, span = (plane.axhline, plane.axhspan) if k else (plane.axvline, plane.axvspan)
+            for wall, beyond in ((history.low[k], -reach), (history.high[k], reach)):
+                if np.isfinite(wall):
+                    line(wall, color="0.2", linewidth=0.8)
+                    span(*sorted((wall, wall + beyond)), color="0.85", linewidth=0)
         plane.set(xlabel=with_unit("$x_1$", history.units[0]), ylabel=with_unit("$x_2$", history.units[1]))
         legend(margin, plane, cost)
         margin.set_ylabel("distance to a wall")
@@ -310,17 +289,6 @@ def draw_box(history: BoxHistory) -> Figure:
         against_time((margin, barrier, cost), history.time)
         letter(grid)
     return figure
-
-
-def walls(axes: Axes, low: np.ndarray, high: np.ndarray) -> None:
-    """Draw the walls of the first two coordinates, and shade what lies beyond."""
-    for k, ends in enumerate((axes.get_xlim(), axes.get_ylim())):
-        reach = 0.06 * (ends[1] - ends[0])
-        line, span = (axes.axhline, axes.axhspan) if k else (axes.axvline, axes.axvspan)
-        for wall, sign in ((low[k], -1), (high[k], 1)):
-            if np.isfinite(wall):
-                line(wall, color="0.2", linewidth=0.8)
-                span(*sorted((wall, wall + sign * reach)), color="0.85", linewidth=0)
 
 
 class AvoidanceHistory(NamedTuple):

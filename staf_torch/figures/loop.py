@@ -68,30 +68,28 @@ def draw_loop(picture: LoopPicture, width: object = None, font: object = None) -
     sizes = [_range(picture.state[..., i]) for i in range(len(picture.state_units))]
     states = by_unit("state $x$", "x", picture.state_units, sizes)
     inputs = by_unit("control $u$", "u", picture.input_units) if picture.input_units else []
+    beside = [None] * 3 if picture.beside is None else [each[:, thinned] for each in picture.beside]
     with (
         printed_on(FigurePaper.chosen("LoopResult.figure", "", width, font)),
         panels(len(states) + len(inputs) + 1) as (figure, grid),
     ):
-        left, titles = iter(grid), []
-        other = [None] * 3 if picture.beside is None else [each[:, thinned] for each in picture.beside]
+        left, titles = iter(grid), [""] * len(states)
         for name, entries in states:
             axes = next(left)
-            values, beside = picture.state[:, thinned][..., entries], _of(other[0], entries)
-            _vector(axes, time, values, beside, _names("x", entries, picture.state_units))
+            _vector(axes, time, picture.state[:, thinned], beside[0], entries, "x")
             if picture.wanted is not None:
                 for k, entry in enumerate(entries):
                     line = picture.wanted[thinned, entry]
                     axes.plot(time, line, ":", color="0.2", label=None if k else "wanted")
             axes.set_ylabel(name)
-            titles.append("")
         for name, entries in inputs:
             axes = next(left)
-            values, beside = picture.control[:, thinned][..., entries], _of(other[1], entries)
-            _vector(axes, time, values, beside, _names("u", entries, picture.input_units), held=True)
+            _vector(axes, time, picture.control[:, thinned], beside[1], entries, "u", held=True)
             titles.append(bounds(axes, picture.low[entries], picture.high[entries]))
             axes.set_ylabel(name)
         axes = next(left)
-        _vector(axes, time, picture.cost[:, thinned, None], _column(other[2]), ["this loop"])
+        other = None if beside[2] is None else beside[2][..., None]
+        _vector(axes, time, picture.cost[:, thinned, None], other, [0], "")
         axes.set_ylabel("cost so far")
         against_time(grid, time)
         letter(grid, *titles, "")
@@ -109,39 +107,29 @@ def _range(values: np.ndarray) -> float:
     return float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
 
 
-def _of(values: np.ndarray | None, entries: list[int]) -> np.ndarray | None:
-    return None if values is None else values[..., entries]
-
-
-def _column(values: np.ndarray | None) -> np.ndarray | None:
-    return None if values is None else values[..., None]
-
-
-def _names(letter: str, entries: Sequence[int], units: Sequence[str]) -> list[str]:
-    """Return the names of entries of a vector, with a number where it has several."""
-    return [f"${letter}_{{{entry + 1}}}$" if len(units) > 1 else f"${letter}$" for entry in entries]
-
-
 def _vector(
     axes: Axes,
     time: np.ndarray,
     values: np.ndarray,
     beside: np.ndarray | None,
-    names: Sequence[str],
+    entries: Sequence[int],
+    letter: str,
     held: bool = False,
 ) -> None:
-    """Draw entries (R, T, k) of all rows, those of the other loop behind; as steps where they are held."""
+    """Draw entries of vectors (R, T, n) of all rows, those of the other loop behind; held ones as steps."""
     steps: dict[str, Any] = {"drawstyle": "steps-post"} if held else {}
     if beside is not None:
         broad: dict[str, Any] = {"color": "0.7", "linewidth": 2.4, "solid_capstyle": "butt", **steps}
         for row in beside:
-            axes.plot(time, row, **broad)
+            axes.plot(time, row[:, entries], **broad)
         axes.get_lines()[-1].set_label("LQR")
-    for k, name in enumerate(names):
+    for k, entry in enumerate(entries):
         look = {"linestyle": dash(k), "color": colour(k), **steps}
-        for row in values[1:, :, k]:
+        for row in values[1:, :, entry]:
             axes.plot(time, row, linewidth=0.5, alpha=0.6, **look)
-        axes.plot(time, values[0, :, k], label=name, **look)
+        several = values.shape[-1] > 1
+        name = (f"${letter}_{{{entry + 1}}}$" if several else f"${letter}$") if letter else "this loop"
+        axes.plot(time, values[0, :, entry], label=name, **look)
 
 
 def bounds(axes: Axes, low: np.ndarray, high: np.ndarray) -> str:
