@@ -81,8 +81,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
         row = {"functions": functions, "points": points} | comparison_row(result, ratio, final)
         study.add(f"{label_key(name)}_", row, {"microseconds": 1e6 * seconds}, method=name)
         ratios[name] = torch.where(regulated(result, final), ratio, torch.inf).cpu().numpy()
-    drawing = (lambda: draw_comparison(ratios)) if draws(cfg.figures) else None
-    return study.write(RunDirectory(directory), drawing, "adp_comparison")
+    return study.write(cfg, RunDirectory(directory), lambda: draw_comparison(ratios), "adp_comparison")
 
 
 def held(cfg: DictConfig) -> dict[str, Tensor]:

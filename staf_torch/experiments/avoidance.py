@@ -18,7 +18,6 @@ from ..adp.loop.controller import Policy
 from ..adp.safety.conditions import Constraint
 from ..figures.animation import Curves, Scene
 from ..figures.closed_loop import AvoidanceHistory, draw_avoidance
-from ..figures.style import draws
 from ..metrics.closed_loop import constraint_metrics
 from ..numerics.checks import COMMAND_LINE, choice, integer, positive_real
 from ..results.run_directory import RunDirectory
@@ -204,7 +203,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
         arrays[f"{vehicle.label.lower()}_distance"] = distances[BARE]
         write_history(out, filtered.time, arrays | {"running_cost": filtered.running_cost})
     write_animation(cfg, out, "avoidance", lambda: _scene(vehicle, shown))
-    return study.write(out, (lambda: draw_avoidance(shown)) if draws(cfg.figures) else None)
+    return study.write(cfg, out, lambda: draw_avoidance(shown))
 
 
 run.animates = True  # type: ignore[attr-defined]

@@ -20,7 +20,7 @@ from ..metrics.chase import ChaseMetrics, Member
 from ..optim import UpdateLaw
 from ..settings.chase import ChaseProblem, warnings_to
 from ..systems import ControlAffineSystem, trajectory
-from .numbers_of_jobs import RowsOfJobs, in_calls
+from .registry import RowsOfJobs, in_calls
 
 Sink = Callable[[Mapping[str, np.ndarray], int, int], None]
 """Takes a piece of a problem's history, name -> (b, C, ...), with its first row and its first time."""

@@ -14,7 +14,6 @@ from torch import Tensor
 from .. import adp
 from ..adp import LQR, AdaptiveLQR, Cost, IntegralWindows, LeastSquares, LoopResult, Measured, ParametricPlant
 from ..figures.closed_loop import FaultPicture, draw_faults
-from ..figures.style import draws
 from ..numerics.checks import COMMAND_LINE, choice, integer, positive_real
 from ..results.run_directory import RunDirectory
 from ..settings.chase import generator_of, placement, plain
@@ -56,7 +55,6 @@ class FaultCase(NamedTuple):
 
 def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
     """Run every case with three policies and fill the run directory; `metrics.json` comes last."""
-    figures = draws(cfg.figures)
     study = Study("faults", _COLUMNS, ("cost_median", "cost_max", "regulated"), _log, digits=5)
     pictures: dict[str, FaultPicture] = {}
     for name, case, results in loops(cfg):
@@ -68,7 +66,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
                 measured |= _learned(case, result)
             study.add(f"{name}_{method.replace(' ', '_')}_", measured, case=label, method=method)
         pictures[label] = _picture(case, results)
-    return study.write(RunDirectory(directory), (lambda: draw_faults(pictures)) if figures else None)
+    return study.write(cfg, RunDirectory(directory), lambda: draw_faults(pictures))
 
 
 def loops(cfg: DictConfig) -> Iterator[tuple[str, FaultCase, dict[str, LoopResult]]]:

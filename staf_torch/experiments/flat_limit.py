@@ -6,12 +6,12 @@ The truth in high precision needs nothing but the standard library.
 from __future__ import annotations
 
 import copy
-import functools
 import itertools
 import logging
 import math
 from collections.abc import Callable, Sequence
 from decimal import Decimal, localcontext
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,7 +23,6 @@ from torch import Tensor
 from ..approximation.basis import StaFBasis, Target
 from ..centers import StateFollowingCenters, probe_points, rings
 from ..figures.chase import ErrorPanel, draw_errors
-from ..figures.style import draws
 from ..kernels import ExponentialKernel, GaussianKernel, Kernel
 from ..local_basis import evaluate_scaled, newton_space
 from ..numerics.checks import COMMAND_LINE, fail, integer, positive_real
@@ -70,7 +69,7 @@ def graded(basis: StaFBasis, target: Target, x: Tensor, z: Tensor) -> Tensor:
 
 METHODS: dict[str, tuple[str, Method]] = {
     "cholesky": ("Cholesky", cholesky),
-    "jitter": ("Cholesky, jitter 1e-12", functools.partial(cholesky, jitter=1e-12)),  # the usual remedy
+    "jitter": ("Cholesky, jitter 1e-12", partial(cholesky, jitter=1e-12)),  # the usual remedy
     "pivoted": ("pivoted Cholesky", pivoted),
     "graded": ("graded basis", graded),
 }
@@ -166,14 +165,13 @@ class FlatLimitErrors(NamedTuple):
 def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
     """Run what the settings describe and fill the run directory; `metrics.json` comes last."""
     problem = problem_of(cfg)
-    figures = draws(cfg.figures)
     tell_of_cpu(cfg, _log, "what is compared is rounding, in both dtypes")
     samples = solve(problem, progress)
     out = RunDirectory(directory)
-    drawing = (lambda: draw_errors(_panels(samples), rows=len(DTYPES))) if figures else None
     heading = f"Relative value error against the radius, {type(problem.kernel).__name__}:"
     shown = _shown(problem, samples)
-    report(out, _log, "flat_limit", _every(samples), drawing, shown=shown, heading=heading)
+    table, drawing = _every(samples), partial(draw_errors, _panels(samples), len(DTYPES))
+    report(cfg, out, _log, "flat_limit", table, drawing, shown=shown, heading=heading)
     return out.metrics(summary(samples))
 
 

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from ..adp import ConcurrentTracker, LoopResult, Measured, ParametricPlant, QuadraticCost
 from ..figures.closed_loop import GainSets, draw_gain_sets
-from ..figures.style import draws
 from ..numerics.checks import COMMAND_LINE, fail, integer, non_negative, positive_real, real, vector
 from ..results.run_directory import RunDirectory
 from ..settings.chase import generator_of, placement, plain, seed_of
@@ -38,7 +37,6 @@ _COLUMNS = {
 
 def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
     """Run both sources with the same gains and noise and fill the run directory, `metrics.json` last."""
-    figures = draws(cfg.figures)
     settle = non_negative(COMMAND_LINE, "settle_time", cfg.settle_time)
     found, truth = loops(cfg), published().theta
     time = found["integral"].time
@@ -71,7 +69,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
         parameter_error={name: values.numpy() for name, values in rms["parameter_error"].items()},
         followed={name: error[shown].norm(dim=-1).numpy() for name, error in errors.items()},
     )
-    return study.write(RunDirectory(directory), (lambda: draw_gain_sets(picture)) if figures else None)
+    return study.write(cfg, RunDirectory(directory), lambda: draw_gain_sets(picture))
 
 
 def loops(cfg: DictConfig) -> dict[str, LoopResult]:

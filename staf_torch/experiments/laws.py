@@ -6,8 +6,9 @@ import dataclasses
 import json
 import logging
 import math
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from omegaconf import DictConfig
@@ -16,7 +17,6 @@ from torch import Tensor
 from .. import optim, theory
 from ..engine.predictors import Predictor, Secant, Tangent
 from ..figures.chase import ConvergenceCurve, draw_convergence
-from ..figures.style import draws
 from ..metrics.ball_error import StateErrorPass
 from ..numerics.checks import COMMAND_LINE, fail, integer, positive_real, vector
 from ..optim import UpdateLaw
@@ -28,6 +28,9 @@ from ..tables import Table
 from . import chase_batch
 from .registry import Metrics, finite, log_slope
 from .study import report
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _log = logging.getLogger(__name__)
 _STATES = 400  # at which the a-priori constants are taken
@@ -142,10 +145,10 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     out = RunDirectory(directory)
     every = Table.of([{name: value for name, value in row.items() if name != "key"} for row in rows])
     out.text("laws.json", json.dumps(rows, indent=2, allow_nan=False) + "\n")
-    drawing = (lambda: draw_convergence(_lines(swept, steps))) if draws(cfg.figures) else None
     about = f"t >= {problem.settle_time:g} s, dt = {problem.dt:g} s, {problem.basis.count} centers"
     heading = f"Worst over {about}:"
-    report(out, _log, "laws", every, drawing, shown=Table.of(rows, _HEADINGS), heading=heading)
+    shown = Table.of(rows, _HEADINGS)
+    report(cfg, out, _log, "laws", every, partial(_drawn, swept, steps), shown=shown, heading=heading)
     _summarise(problem, swept, promised, excess)
     numbers = {(row["key"], name): x for row in rows for name, x in row.items() if not isinstance(x, str)}
     numbers |= {(curve.case.key, "slope"): curve.slope for curve in swept}
@@ -163,14 +166,15 @@ def table(
             "iterations": case.iterations,
             "predictor": case.predicted,
             "products": case.products / problem.dt,
-            **_metrics(_with(problem, case), errors),
+            **_metrics(problem, case, errors),
         }
         for case in progress.each(compared, "laws")
     ]
 
 
-def _metrics(problem: ChaseProblem, errors: StateErrorPass) -> Metrics:
-    (outcome,) = chase_batch.simulate([problem], [None], [False], errors=errors)
+def _metrics(problem: ChaseProblem, case: LawCase, errors: StateErrorPass) -> Metrics:
+    law = {"law": case.law, "inner_steps": case.iterations, "predictor": case.predictor}
+    (outcome,) = chase_batch.simulate([dataclasses.replace(problem, **law)], [None], [False], errors=errors)
     return outcome.metrics
 
 
@@ -185,8 +189,8 @@ def sweep(
     duration = problem.dt * problem.steps
 
     def excess(case: LawCase, dt: float) -> float | None:
-        refined = dataclasses.replace(_with(problem, case), dt=dt, steps=math.floor(duration / dt + 1e-9))
-        return _metrics(refined, errors)["ultimate_excess_before"]
+        refined = dataclasses.replace(problem, dt=dt, steps=math.floor(duration / dt + 1e-9))
+        return _metrics(refined, case, errors)["ultimate_excess_before"]
 
     found = []
     for case in progress.each(drawn, "laws over all dt"):
@@ -229,10 +233,6 @@ def _states(problem: ChaseProblem) -> Tensor:
 run.held = lambda cfg: {"state": _states(chase_problem(cfg))}  # type: ignore[attr-defined]
 
 
-def _with(problem: ChaseProblem, case: LawCase) -> ChaseProblem:
-    return dataclasses.replace(problem, law=case.law, inner_steps=case.iterations, predictor=case.predictor)
-
-
 def _steps(cfg: DictConfig, problem: ChaseProblem) -> list[float]:
     name, duration = "laws.steps", problem.dt * problem.steps
     listed = vector(COMMAND_LINE, name, plain(cfg.laws.steps))
@@ -243,17 +243,13 @@ def _steps(cfg: DictConfig, problem: ChaseProblem) -> list[float]:
     return steps
 
 
-def _lines(swept: list[LawCurve], steps: list[float]) -> list[ConvergenceCurve]:
-    return [
-        ConvergenceCurve(
-            label=f"{curve.case.name} x{curve.case.iterations}"
-            + (f", {curve.case.predicted}" if curve.case.predictor is not None else ""),
-            step=np.array(steps),
-            excess=np.array(curve.excess, dtype=float),  # None: NaN
-            slope=curve.slope,
-        )
-        for curve in swept
-    ]
+def _drawn(swept: list[LawCurve], steps: list[float]) -> Figure:
+    curves = []
+    for case, excess, slope in swept:
+        label = f"{case.name} x{case.iterations}" + ("" if case.predictor is None else f", {case.predicted}")
+        # a missing excess is NaN
+        curves.append(ConvergenceCurve(label, np.array(steps), np.array(excess, dtype=float), slope))
+    return draw_convergence(curves)
 
 
 def _summarise(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,7 +17,6 @@ from torch import Tensor
 from ..approximation.basis import StaFBasis
 from ..centers import ConstantRadius, StateFollowingCenters, probe_points
 from ..figures.chase import LearnedKernel, draw_learned_kernel
-from ..figures.style import draws
 from ..kernels import Kernel
 from ..lanes import rows
 from ..local_basis import evaluate_scaled
@@ -96,9 +96,9 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     way = path.exp()
     numbers = [x.cpu().numpy() for x in (widths, radii, grid, way, errors)]
     picture = LearnedKernel(problem.name, *numbers)
-    drawing = (lambda: draw_learned_kernel(picture)) if draws(cfg.figures) else None
     shown = Table.of(taken[:: -(-len(taken) // _SHOWN)])
-    report(out, _log, "learn_kernel", Table.of(taken), drawing, shown=shown, heading="Along the way:")
+    table, drawing = Table.of(taken), partial(draw_learned_kernel, picture)
+    report(cfg, out, _log, "learn_kernel", table, drawing, shown=shown, heading="Along the way:")
     return out.metrics(summary(path, errors, widths, radii, grid))
 
 

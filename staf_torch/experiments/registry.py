@@ -15,25 +15,35 @@ An experiment of your own needs no change here. Write a function or a class in a
 Then `staf --config-dir my_conf experiment=energy` runs the experiment and `staf -m --config-dir my_conf
 experiment=energy seed=0,1` sweeps it; `hydra.searchpath=[file://my_conf]` does what `--config-dir` does.
 `energy.held = ...`, a function of the settings, lets it have a dry run (`study`).
-Derive a class from `BatchedExperiment` where many jobs can be computed as one tensor batch.
+Derive a class from `BatchedExperiment` where many jobs can be computed as one tensor batch; `in_calls` then
+makes one call of jobs whose objects differ in numbers alone.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib
+import logging
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from pathlib import Path
-from typing import ClassVar, Generic, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
+import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
+from ..lanes.dependencies.contents import Contents
+from ..lanes.per_row.objects import merged
+from ..lanes.row_numbers import some_rows
 from ..numerics.checks import COMMAND_LINE, choice, fail
+from ..results.files import grouped
 from ..signs import SHOWN, Progress
+
+_log = logging.getLogger(__name__)
 
 Metrics = dict[str, float | None]
 """Name to number; None where there is nothing finite to report."""
@@ -186,3 +196,92 @@ def check_animation(cfg: DictConfig) -> None:
     if wanted is not False and not getattr(experiment(cfg.task), "animates", False):
         rule = f"must be false for the task {cfg.task}, which has no animation"
         raise fail(COMMAND_LINE, "animation", rule, wanted)
+
+
+_REFUSALS = (ValueError, TypeError, NotImplementedError, RuntimeError)
+"""What objects raise that do not serve numbers of a row's own."""
+
+_R = TypeVar("_R")
+Advance = Callable[[int], None]
+
+
+class RowsOfJobs:
+    """The rows of a call, each with the numbers of its job.
+
+    ``kinds`` has the row of numbers of each job, ``counts`` its rows; `differ` says whether jobs have numbers
+    of their own.
+    """
+
+    def __init__(self, kinds: Sequence[int], counts: Sequence[int]) -> None:
+        self.differ = len(set(kinds)) > 1
+        kind, count = (torch.tensor(each, dtype=torch.int64, device="cpu") for each in (kinds, counts))
+        self._kind = kind.repeat_interleave(count)
+
+    def of(self, rows: slice = slice(None)) -> contextlib.AbstractContextManager[None]:
+        """Batches of the block hold these rows of the call."""
+        return some_rows(self._kind[rows]) if self.differ else contextlib.nullcontext()
+
+
+class _Set(NamedTuple):
+    """Jobs of one call."""
+
+    jobs: list[int]
+    objects: tuple[Any, ...]  # with the numbers of all of them
+    kinds: list[int]  # of each job, the row of its numbers
+    alone: list[_Set]  # the calls in place of this one where it refuses numbers of a row's own
+
+
+def in_calls(
+    call: Callable[[Sequence[int], Any, RowsOfJobs, Advance | None], Sequence[_R]],
+    objects: Sequence[tuple[Any, ...]],
+    counts: Sequence[int],
+    alike: Sequence[Hashable],
+    advance: Advance | None = None,
+) -> list[_R]:
+    """Return the results of jobs, of which those whose objects differ in numbers alone share a call.
+
+    Where objects differ in more there are several calls, and where one refuses numbers of a row's own, as not
+    all objects serve them, its jobs run one after the other: those of the same objects together.
+
+    Args:
+        call: gets the jobs by number, the objects that have the numbers of all, their rows, and `advance`.
+        objects: of each job; the same object for jobs that share it.
+        counts: rows of each job.
+        alike: what jobs must have in common to share a call.
+        advance: is told how much more is done; None where nobody listens.
+    """
+    found: dict[int, _R] = {}
+    groups = grouped(range(len(objects)), lambda i: alike[i]).values()
+    waiting: list[_Set] = []
+    for jobs in groups:
+        same = grouped(jobs, lambda i: tuple(map(id, objects[i]))).values()
+        waiting += _joined([_Set(each, objects[each[0]], [0] * len(each), []) for each in same])
+    while waiting:
+        some = waiting.pop(0)
+        rows = RowsOfJobs(some.kinds, [counts[i] for i in some.jobs])
+        try:
+            results = call(some.jobs, some.objects, rows, advance)
+        except _REFUSALS as error:
+            if not some.alone:
+                raise
+            _log.debug("%d jobs run one after the other: %s", len(some.alone), error)
+            waiting[:0] = some.alone
+        else:
+            found.update(zip(some.jobs, results, strict=True))
+    return [found[i] for i in range(len(objects))]
+
+
+def _joined(alone: list[_Set]) -> list[_Set]:
+    """Return calls of distinct objects as one, or as a few where objects differ in more than numbers."""
+    if len(alone) == 1:
+        return alone
+    try:
+        merged_objects = merged([each.objects for each in alone])
+    except ValueError:  # they differ in more than numbers
+        keys = [Contents(*each.objects, telling=True).key for each in alone]
+        sets = grouped(range(len(alone)), lambda i: (i,) if keys[i] is None else keys[i]).values()
+        if len(sets) == 1:
+            return alone
+        return [each for some in sets for each in _joined([alone[i] for i in some])]
+    kinds = [kind for kind, each in enumerate(alone) for _ in each.jobs]
+    return [_Set([job for each in alone for job in each.jobs], merged_objects, kinds, alone)]

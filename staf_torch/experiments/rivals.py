@@ -16,7 +16,6 @@ from torch import Tensor
 
 from ..adp import BoxDDP, SampledProblem
 from ..figures.closed_loop import draw_rivals
-from ..figures.style import draws
 from ..numerics.checks import COMMAND_LINE, choice, integer
 from ..results.run_directory import RunDirectory
 from ..settings.chase import plain, seed_of
@@ -71,7 +70,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
         for method, measured, more in compare(case, chosen, case.states(states, seed), calls, slow):
             study.add(f"{case.name}_{label_key(method)}_", measured, more, plant=case.name, method=method)
         study.write_table(out)
-    return study.write(out, (lambda: draw_rivals(study.rows)) if draws(cfg.figures) else None)
+    return study.write(cfg, out, lambda: draw_rivals(study.rows))
 
 
 def _chosen(what: str, names: object, known: Mapping[str, Any]) -> list[Any]:

@@ -14,7 +14,6 @@ from ..adp import LQR, BoxFilter, Cost, DirectShooting, Feedback, LoopResult, Qu
 from ..adp.loop.simulation import OptimumSettings
 from ..adp.safety.box_filter import walls
 from ..figures.closed_loop import BoxHistory, draw_box
-from ..figures.style import draws
 from ..metrics.closed_loop import constraint_metrics
 from ..numerics.checks import COMMAND_LINE, fail, flag, integer, positive_real
 from ..results.run_directory import RunDirectory
@@ -122,7 +121,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
         arrays |= {"running_cost": first.running_cost, "margin": margins["LQR of s"]}
         write_history(out, first.time, arrays)
     drawn = _drawn(box, compared, results, margins)
-    return study.write(out, (lambda: draw_box(drawn)) if draws(cfg.figures) else None)
+    return study.write(cfg, out, lambda: draw_box(drawn))
 
 
 run.held = held  # type: ignore[attr-defined]

@@ -19,7 +19,7 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from ..figures.style import images
+from ..figures.style import draws, images
 from ..lanes.trace.tracer import explained
 from ..numerics.checks import COMMAND_LINE, fail
 from ..results.run_directory import Printable, RunDirectory
@@ -98,16 +98,19 @@ class Study:
         table = Table.of(self.rows, self._columns)
         out.table(self._name, dataclasses.replace(table, style=self._style))
 
-    def write(self, out: RunDirectory, drawing: Drawing | None, figure: str | None = None) -> Metrics:
-        """Write the table, the figure (of the table's name by default) where one is wanted, and
+    def write(
+        self, cfg: DictConfig, out: RunDirectory, drawing: Drawing, figure: str | None = None
+    ) -> Metrics:
+        """Write the table, the figure (of the table's name by default) where the settings want one, and
         `metrics.json` at last."""
         self.write_table(out)
-        if drawing is not None:
+        if draws(cfg.figures):
             out.figure(figure or self._name, images(drawing()))
         return out.metrics(self.metrics)
 
 
 def report(
+    cfg: DictConfig,
     out: RunDirectory,
     log: logging.Logger,
     name: str,
@@ -117,11 +120,12 @@ def report(
     shown: Printable | Sequence[Printable] = (),
     heading: str = "",
 ) -> None:
-    """Write a table and the figure of the same name, and log the table below a heading."""
+    """Write a table and the figure of the same name, where the settings want one, and log the table below a
+    heading."""
     text = out.table(name, table, shown=shown)
     for line in [*filter(None, [heading]), *text.splitlines()]:
         log.info("%s", line)
-    if drawing is not None:
+    if drawing is not None and draws(cfg.figures):
         out.figure(name, images(drawing()))
 
 
@@ -236,5 +240,5 @@ class DryRun:
         size = f"{total / 1000**power:.4g} {('B', 'kB', 'MB', 'GB', 'TB')[power]}"
         told = f"the histories of a run take {size}" if rows else "a run keeps no histories"
         heading = f"Dry run, nothing was computed: {told}"
-        report(out, _log, "dry_run", Table.of(rows, dict.fromkeys(columns, "")), None, heading=heading)
+        report(cfg, out, _log, "dry_run", Table.of(rows, dict.fromkeys(columns, "")), None, heading=heading)
         return out.metrics({"history_bytes": float(total)})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import warnings
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +17,6 @@ from torch import Tensor
 from .. import theory
 from ..centers import ball, cross_polytope, polygon, rings, simplex
 from ..figures.chase import Feasibility, LayoutCurve, draw_exponential_bound, draw_feasibility, draw_layouts
-from ..figures.style import draws
 from ..kernels import ExponentialKernel
 from ..numerics.checks import COMMAND_LINE, fail, integer, positive_real
 from ..results.run_directory import RunDirectory
@@ -67,11 +67,14 @@ def layouts(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Met
     radii = numbers(cfg, "layouts.radii")
     found = layout_curves(problem, radii, progress)
     out = RunDirectory(directory)
-    rows = [_layout_row(curve, radii) for curve in found]
-    drawing = (lambda: draw_layouts(found, problem.radius, np.array(radii))) if draws(cfg.figures) else None
+    rows: list[dict[str, Any]] = []
+    for family, count, order, error, errors, slope in found:
+        row = {"layout": family, "count": count, "error": finite(error), "order": order, "slope": slope}
+        rows.append(row | {f"r{r:g}": finite(e) for r, e in zip(radii, errors, strict=True)})
     heading = f"sup |V - V^| on the ball, r = {problem.radius:g}, ideal weights, and its slope in r:"
     shown = Table.of(rows, _LAYOUTS)
-    report(out, _log, "layouts", Table.of(rows), drawing, shown=shown, heading=heading)
+    drawing = partial(draw_layouts, found, problem.radius, np.array(radii))
+    report(cfg, out, _log, "layouts", Table.of(rows), drawing, shown=shown, heading=heading)
     return out.metrics({f"{r['layout']}{r['count']}.{name}": r[name] for r in rows for name in _MEASURED})
 
 
@@ -108,12 +111,6 @@ def layout_curves(problem: LocalProblem, radii: list[float], progress: Progress 
     return found
 
 
-def _layout_row(curve: LayoutCurve, radii: list[float]) -> dict[str, Any]:
-    row = {"layout": curve.family, "count": curve.centers, "error": finite(curve.error)}
-    row |= {"order": curve.order, "slope": curve.slope}
-    return row | {f"r{r:g}": finite(e) for r, e in zip(radii, curve.errors, strict=True)}
-
-
 class Needed(NamedTuple):
     """Centers that are needed, of L layouts, at the states (T) for R radii and E values of epsilon."""
 
@@ -145,13 +142,7 @@ def feasibility(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) ->
         overall=needed.overall.numpy(),
     )
     report(
-        *(
-            out,
-            _log,
-            "feasibility",
-            Table.of(rows),
-            (lambda: draw_feasibility(picture)) if draws(cfg.figures) else None,
-        ),
+        *(cfg, out, _log, "feasibility", Table.of(rows), partial(draw_feasibility, picture)),
         shown=Table.of(wide, headings),
         heading="Smallest M with sup |V - V^| <= eps on the ball along the trajectory, ideal weights:",
     )
@@ -174,12 +165,10 @@ def needed_centers(
     counts = torch.tensor([len(layout) for layout in layouts], dtype=torch.int64, device="cpu")
     allowed = torch.tensor(epsilons, dtype=errors.dtype, device=errors.device)
     good = errors.unsqueeze(1) <= allowed[:, None, None]  # (R, E, L, T)
-    return Needed(counts, errors, _first(good.mT, counts), _first(good.all(-1), counts))
-
-
-def _first(good: Tensor, counts: Tensor) -> Tensor:
-    """The first count that is good, 0 if none is: (..., L), (L,) -> (...)."""
-    return torch.where(good.any(-1), counts[good.int().argmax(-1)], 0)
+    pointwise, overall = (
+        torch.where(enough.any(-1), counts[enough.int().argmax(-1)], 0) for enough in (good.mT, good.all(-1))
+    )
+    return Needed(counts, errors, pointwise, overall)
 
 
 def _counted(needed: Needed, radii: list[float], epsilons: list[float]) -> tuple[Rows, Rows, Metrics]:
@@ -213,8 +202,8 @@ def exponential_bound(cfg: DictConfig, directory: Path, progress: Progress = SHO
     found = bounds(cfg, progress)
     rows = [{"radius": radius, "epsilon": epsilon, **row} for (radius, epsilon), row in found.items()]
     out = RunDirectory(directory)
-    drawing = (lambda: draw_exponential_bound(found)) if draws(cfg.figures) else None
-    report(out, _log, "exponential_bound", Table.of(rows, _BOUNDS), drawing)
+    drawing = partial(draw_exponential_bound, found)
+    report(cfg, out, _log, "exponential_bound", Table.of(rows, _BOUNDS), drawing)
     return out.metrics(
         {f"r{r:g}.eps{e:g}.{name}": value for (r, e), row in found.items() for name, value in row.items()}
     )
