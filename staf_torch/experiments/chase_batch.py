@@ -118,14 +118,14 @@ def _run(
     first, basis = members[0].problem, parts.basis
     times, starts = first.steps + 1, torch.cat([member.problem.initial_states for member in members])
     metrics = _metrics(members, parts, rows, errors)
-    tell = _of_whole_problems(advance, len(starts), len(members))
     blocks, chunk = _pieces(
         starts, times, basis, jobs=len(members), kept=any(member.sink is not None for member in members)
     )
-    told = alone and len(blocks) == 1  # the engine warns of the reach, else each member of its own
+    warned = alone and len(blocks) == 1  # the engine warns of the reach, else each member of its own
+    done_times = told = 0
     done, reaches = 0, list[Tensor]()  # largest |x| nu(x) of the rows of each block
     with torch.no_grad(), warnings.catch_warnings():
-        if not told:
+        if not warned:
             warnings.filterwarnings("ignore", message=REACH)
         for block in blocks:
             reach, time = torch.zeros(len(block), dtype=starts.dtype, device=starts.device), 0
@@ -134,16 +134,20 @@ def _run(
             with rows.of(slice(done, done + len(block))):
                 for result in _chased(first, parts, block, chunk):
                     metrics.add(result)
-                    if not told:
+                    if not warned:
                         reach = torch.maximum(reach, _reach(basis, result.state))
                     _distribute(result, done, time, members)
                     time += result.state.shape[1]
-                    tell(result.state.shape[0] * result.state.shape[1])
+                    done_times += result.state.shape[0] * result.state.shape[1]
+                    whole = done_times * len(members) // len(starts)  # times of whole problems, for progress
+                    if advance is not None and whole > told:
+                        advance(whole - told)
+                        told = whole
                     del result  # before the next one is made
             done += len(block)
             reaches.append(reach)
     reach = torch.cat(reaches)
-    if alone and not told:
+    if alone and not warned:
         basis.warn_reach(float(reach.max()), stacklevel=2)
     found = zip(members, metrics.summaries(), reach.split([member.rows for member in members]), strict=True)
     return [member.outcome(summary, float(own.max()), alone=alone) for member, summary, own in found]
@@ -226,36 +230,22 @@ def _distribute(result: ChaseResult, first: int, time: int, members: Sequence[_B
         start += member.rows
 
 
-def _of_whole_problems(
-    advance: Callable[[int], None] | None, rows: int, problems: int
-) -> Callable[[int], None]:
-    """Return a function that turns times of rows into times of whole problems, for a display of progress."""
-    done = told = 0
-
-    def tell(count: int) -> None:
-        nonlocal done, told
-        done += count
-        new = done * problems // rows - told
-        told += new
-        if advance is not None and new:
-            advance(new)
-
-    return tell
-
-
 class _BatchMember:
     """A problem of a batch, with the metrics and records of its rows."""
 
     def __init__(self, problem: ChaseProblem, sink: Sink | None, drawn: bool) -> None:
         self.problem, self.sink = problem, sink
         self.rows = len(problem.initial_states)
-        self._thinned = _Thinned(problem.steps + 1) if drawn else None
+        self._stride = -(-(problem.steps + 1) // _DRAWN_TIMES)
+        self._drawn: dict[str, list[np.ndarray]] | None = {name: [] for name in _DRAWN} if drawn else None
         self._diverged_at = torch.full((self.rows,), -1, dtype=torch.int64, device="cpu")
 
     def take(self, result: ChaseResult, rows: slice, place: int, time: int) -> None:
         """Take in ``rows`` of a piece of time, which are this problem's from ``place`` on."""
-        if self._thinned is not None and place == 0:
-            self._thinned.add(result, rows.start)
+        if self._drawn is not None and place == 0:  # the first trajectory, thinned to every k-th time
+            for name, parts in self._drawn.items():  # copies: a view would keep the whole piece in memory
+                thinned = getattr(result, name)[rows.start, -time % self._stride :: self._stride]
+                parts.append(thinned.cpu().numpy().copy())
         if self.sink is not None:
             history = {name: getattr(result, name)[rows].cpu().numpy() for name in HISTORY}
             self.sink(history, place, time)
@@ -264,29 +254,10 @@ class _BatchMember:
     def outcome(self, metrics: dict[str, float | None], reach: float, *, alone: bool) -> Outcome:
         """Return the result; the largest |x| nu(x) of a problem that is not ``alone`` may be warned of."""
         drawn, said = {}, list[str]()
-        if self._thinned is not None:
-            time = np.arange(self.problem.steps + 1) * self.problem.dt
-            drawn = self._thinned.arrays() | {"time": time[:: self._thinned.stride]}
+        if self._drawn is not None:
+            time = np.arange(0, self.problem.steps + 1, self._stride) * self.problem.dt
+            drawn = {name: np.concatenate(parts) for name, parts in self._drawn.items()} | {"time": time}
         if not alone:
             with warnings_to(said):
                 self.problem.basis.warn_reach(reach)
         return Outcome(metrics, drawn, self._diverged_at, tuple(said))
-
-
-class _Thinned:
-    """The first trajectory, thinned to every k-th time, for the figure."""
-
-    def __init__(self, times: int) -> None:
-        self.stride = -(-times // _DRAWN_TIMES)
-        self._time = 0
-        self._parts: dict[str, list[np.ndarray]] = {name: [] for name in _DRAWN}
-
-    def add(self, result: ChaseResult, row: int) -> None:
-        first = -self._time % self.stride
-        for name, parts in self._parts.items():
-            # A copy: a view would keep the whole piece in memory.
-            parts.append(getattr(result, name)[row, first :: self.stride].cpu().numpy().copy())
-        self._time += result.state.shape[1]
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        return {name: np.concatenate(parts) for name, parts in self._parts.items()}

@@ -7,8 +7,9 @@ import dataclasses
 import logging
 import math
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -32,8 +33,7 @@ from .study import log_diverged, trajectories
 _log = logging.getLogger(__name__)
 
 
-@dataclasses.dataclass(frozen=True)
-class Title:
+class Title(NamedTuple):
     """A problem in a few words, for the log."""
 
     rows: int
@@ -93,15 +93,13 @@ class GradientChase(BatchedExperiment[ChaseSolution]):
         problem = chase_problem(cfg)
         figures, history = _wanted(cfg, problem)
         out, title = RunDirectory(directory), Title.of(problem)
-        with contextlib.ExitStack() as stack:
-            writer = stack.enter_context(out.history(title.rows, title.times)) if history else None
-            advance = stack.enter_context(progress.over(title.times, "times"))
+        kept = out.history(title.rows, title.times) if history else contextlib.nullcontext()
+        with kept as writer, progress.over(title.times, "times") as advance:
             sink = None if writer is None else lambda pieces, row, _: writer.add(pieces, row)
             (outcome,) = simulate([problem], [sink], [figures], advance)
             if writer is not None:
                 writer.close(time=_times(title))
-        starts = problem.initial_states.cpu().numpy()
-        return _finish(out, ChaseSolution(title, outcome, starts, units=_units(problem)), cfg)
+        return _finish(out, _solved(problem, outcome), cfg)
 
     def held(self, cfg: DictConfig) -> dict[str, Tensor]:
         """Return the history of a run; nothing where none is kept."""
@@ -123,7 +121,10 @@ class GradientChase(BatchedExperiment[ChaseSolution]):
             times = sum(problem.steps + 1 for problem in problems)
             with warnings_to(common), progress.over(times, "times") as advance:
                 left = iter(simulate(problems, sinks, drawn, advance))
-        return [each.solved(next(left), common) if isinstance(each, _Ready) else each for each in prepared]
+        return [
+            _solved(each.problem, next(left), each, common) if isinstance(each, _Ready) else each
+            for each in prepared
+        ]
 
     def write(self, cfg: DictConfig, directory: Path, solution: ChaseSolution) -> Metrics:
         """Fill the run directory with what was solved; `metrics.json` comes last."""
@@ -159,21 +160,13 @@ class GradientChase(BatchedExperiment[ChaseSolution]):
         return 8 * times * (rows * kept + (n + 5 + 2 * m))
 
 
-@dataclasses.dataclass(frozen=True)
-class _Ready:
+class _Ready(NamedTuple):
     """A member of a batch before it is solved."""
 
     problem: ChaseProblem
     figures: bool  # whether the first trajectory is drawn, at rest or in motion
     memory: _Memory | None  # takes the history; None where nobody wants it
     warnings: list[str]
-
-    def solved(self, outcome: Outcome, common: Sequence[str]) -> ChaseSolution:
-        """With what the whole batch was warned of."""
-        history = None if self.memory is None else self.memory.arrays
-        starts = self.problem.initial_states.cpu().numpy()
-        told, units = dict.fromkeys([*self.warnings, *common, *outcome.warnings]), _units(self.problem)
-        return ChaseSolution(Title.of(self.problem), outcome, starts, history, tuple(told), units)
 
 
 def _prepared(cfg: DictConfig | PlainSettings, parts: Parts) -> _Ready | Exception:
@@ -186,6 +179,20 @@ def _prepared(cfg: DictConfig | PlainSettings, parts: Parts) -> _Ready | Excepti
         return error
     memory = _Memory(len(problem.initial_states), problem.steps + 1) if history else None
     return _Ready(problem, figures, memory, said)
+
+
+def _solved(
+    problem: ChaseProblem, outcome: Outcome, member: _Ready | None = None, common: Sequence[str] = ()
+) -> ChaseSolution:
+    """Return a solution; that of a member has its history and what the whole batch was warned of as well."""
+    starts = problem.initial_states
+    units: Units = getattr(problem.system, "units", Units())  # of any module with the methods of a plant
+    history, said = None, list[str]()
+    if member is not None:
+        history = None if member.memory is None else member.memory.arrays
+        said = list(dict.fromkeys([*member.warnings, *common, *outcome.warnings]))
+    about = Title.of(problem), outcome, starts.cpu().numpy(), history
+    return ChaseSolution(*about, tuple(said), units.of_states(starts.shape[-1]))
 
 
 class _Memory:
@@ -208,11 +215,6 @@ def _wanted(cfg: DictConfig | PlainSettings, problem: ChaseProblem) -> tuple[boo
     drawn = draws(cfg.figures)
     moving = animation_kind(cfg, problem.basis.dim) is not None
     return drawn or moving, flag(COMMAND_LINE, "history", cfg.history)
-
-
-def _units(problem: ChaseProblem) -> tuple[str, ...]:
-    units: Units = getattr(problem.system, "units", Units())  # of any module with the methods of a plant
-    return units.of_states(problem.initial_states.shape[-1])
 
 
 def _finish(out: RunDirectory, solved: ChaseSolution, cfg: DictConfig) -> Metrics:
@@ -249,17 +251,11 @@ def _summarise(title: Title, metrics: dict[str, float | None]) -> None:
     ideal = "-" if metrics["ultimate_excess"] is None else "0"
     _log.info(row, "excess F(a) - F(w)", *map(show, ("ultimate_excess", "ultimate_excess_before")), ideal)
     _log.info("  error on the ball %s, gradient error %s", show("ball_error"), show("gradient_error"))
+    time = metrics["settling_time"]
+    since = "at all times" if time == 0 else f"from {show('settling_time')} s on"
+    excess = f"excess {since} at most {show('ultimate_excess')}"
     _log.info(
         "  condition number %s, %s, contraction violations %s, diverged %s",
-        show("condition_number"),
-        _settled(metrics["settling_time"], show),
+        *(show("condition_number"), "excess not known" if time is None else excess),
         *map(show, ("contraction_violations", "diverged_fraction")),
     )
-
-
-def _settled(time: float | None, show: Callable[[str], str]) -> str:
-    """Say from when on the excess is at most its largest value after `settle_time`: maybe from the start."""
-    if time is None:
-        return "excess not known"
-    since = "at all times" if time == 0 else f"from {show('settling_time')} s on"
-    return f"excess {since} at most {show('ultimate_excess')}"
