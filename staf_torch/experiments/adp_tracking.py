@@ -128,23 +128,24 @@ def _controllers(cfg: DictConfig, plant: TwoStateTracking, cost: QuadraticCost) 
     }
 
 
-def _errors(result: LoopResult) -> Tensor:
-    """|e|, (B, T); NaN from where a row diverged on."""
-    time = result.time.to(result.frozen_at)
-    return torch.where(time > result.frozen_at.unsqueeze(-1), torch.nan, result.state[..., :2].norm(dim=-1))
-
-
 def _drawn(results: dict[str, LoopResult], parameters: Tensor, theta: Tensor) -> TrackingHistory:
-    """The first trajectory."""
+    """The first trajectory; |e| is NaN from where it diverged on."""
 
     def first(rows: Tensor) -> np.ndarray:
         return rows[0].cpu().numpy()
 
+    shown = results["identified"]
+    errors = {
+        name: torch.where(
+            one.time.to(one.frozen_at) > one.frozen_at[0], torch.nan, one.state[0, :, :2].norm(dim=-1)
+        )
+        for name, one in results.items()
+    }
     return TrackingHistory(
-        time=results["identified"].time.numpy(),
-        state=first(results["identified"].state),
-        errors={name: first(_errors(result)) for name, result in results.items()},
+        time=shown.time.numpy(),
+        state=first(shown.state),
+        errors={name: error.cpu().numpy() for name, error in errors.items()},
         parameters=first(parameters.flatten(-2)),
         truth=theta.flatten().cpu().numpy(),
-        critic_weights=first(results["identified"].critic_weights),
+        critic_weights=first(shown.critic_weights),
     )

@@ -7,7 +7,7 @@ import logging
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -77,19 +77,12 @@ def _chosen(what: str, names: object, known: Mapping[str, Any]) -> list[Any]:
     return [known[str(choice(COMMAND_LINE, f"rivals.{what}", name, tuple(known)))] for name in plain(names)]
 
 
-class RivalRow(NamedTuple):
-    """A row of the table: a method on one plant."""
-
-    method: str
-    measured: dict[str, float | None]  # of its controls, for the metrics; None: it did not run
-    more: dict[str, Any]  # times, sizes and a note, for the table
-
-
 def compare(
     case: RivalPlant, rivals: Sequence[Rival], x0: Tensor, calls: int, slow: int | None = None
-) -> list[RivalRow]:
-    """The rows of one plant; slow methods run from so many of the states and a fifth of the calls are timed,
-    with a note of it; None: as many as the others."""
+) -> list[tuple[str, Metrics, dict[str, Any]]]:
+    """The rows of one plant: a method, its metrics (None: it did not run), and for the table its times, sizes
+    and a note. Slow methods run from so many of the states and a fifth of the calls are timed, with a note of
+    it; None: as many as the others."""
     problem = case.problem()
     episodes: dict[str, Episode] = {}
     times: dict[str, list[float]] = {}
@@ -116,9 +109,15 @@ def compare(
     best = best_known(case, problem, x0, list(episodes.values()))
     rows = []
     for rival in rivals:
-        played = episodes.get(rival.name)
-        more = _told(rival, played, times.get(rival.name), notes.get(rival.name))
-        rows.append(RivalRow(rival.name, _measured(played, best, case.left), more))
+        megabytes = None if rival.missing else rival.megabytes
+        more: dict[str, Any] = dict.fromkeys(("us_median", "us_p99", "offline"))
+        more |= {"megabytes": megabytes, "lines": rival.lines, "note": notes.get(rival.name)}
+        measured: Metrics = dict.fromkeys(("ratio_median", "ratio_max", "regulated", "violations"))
+        if played := episodes.get(rival.name):
+            median, high = np.quantile(times[rival.name], (0.5, 0.99))
+            more |= {"us_median": float(median), "us_p99": float(high), "offline": played.offline}
+            measured = _measured(played, best, case.left)
+        rows.append((rival.name, measured, more))
     return rows
 
 
@@ -191,9 +190,8 @@ def _by_ipopt(
     return torch.tensor(found, dtype=torch.float64, device="cpu")
 
 
-def _measured(episode: Episode | None, best: Tensor, share: float) -> Metrics:
-    if episode is None:
-        return dict.fromkeys(("ratio_median", "ratio_max", "regulated", "violations"))
+def _measured(episode: Episode, best: Tensor, share: float) -> Metrics:
+    """Return what the metrics have of the controls of a method."""
     best = best[: len(episode.cost)]
     up = episode.left <= share * best
     ratio = (episode.cost / best)[up]
@@ -202,17 +200,4 @@ def _measured(episode: Episode | None, best: Tensor, share: float) -> Metrics:
         "ratio_max": float(ratio.max()) if len(ratio) else None,
         "regulated": float(up.double().mean()),
         "violations": episode.outside,
-    }
-
-
-def _told(
-    rival: Rival, episode: Episode | None, times: list[float] | None, note: str | None
-) -> dict[str, Any]:
-    return {
-        "us_median": None if times is None else float(np.median(times)),
-        "us_p99": None if times is None else float(np.quantile(times, 0.99)),
-        "offline": None if episode is None else episode.offline,
-        "megabytes": None if rival.missing else rival.megabytes,
-        "lines": rival.lines,
-        "note": note,
     }

@@ -91,7 +91,8 @@ def loop_scene(problem: AdpProblem, result: LoopResult) -> Scene:
 
     optimum = None if known_value(problem, problem.initial_states) is None else known
     # The state is fast at first and then rests: half of the frames are of the first quarter of the time.
-    at = frames(_moves_until(result.state[0]), 2)
+    far = result.state[0].norm(dim=-1)
+    at = frames(max(1, int((far > 0.01 * far.max()).nonzero().max())), 2)
     scene = _scene(problem.controller, result, at, optimum)
     return scene._replace(units=problem.system.units.of_states(result.state.shape[-1]))
 
@@ -109,15 +110,10 @@ def tracking_scene(controller: Controller, result: LoopResult) -> Scene:
     )
 
 
-def _moves_until(path: Tensor) -> int:
-    """Return the index of the last time at which a state (T, n) is further than a hundredth of its way."""
-    far = path.norm(dim=-1)
-    return max(1, int((far > 0.01 * far.max()).nonzero().max()))
-
-
 def _scene(controller: Controller, result: LoopResult, at: np.ndarray, optimum: Value | None) -> Scene:
     path = result.state[0]
     x, critic = path[at], result.critic_weights[0, at]
+    controller = _inner(controller)
     basis = _moving(controller)
     with torch.no_grad():
         radius, centers = 0.1 * path.norm(dim=-1).max(), x.new_zeros(len(at), 0, 2)
@@ -135,25 +131,17 @@ def _scene(controller: Controller, result: LoopResult, at: np.ndarray, optimum: 
             state=_array(x[:, :2]),
             centers=_array(centers),
             radius=_array(radius),
-            curves=_curves(result, at),
+            # No ideal weights: the critic learns from the Bellman error, and K^-1 V(c) grows beyond all bounds
+            # where the ball shrinks with the state.
+            curves=Curves("weights of the critic", _array(critic), None)
+            if critic.shape[-1]
+            else Curves("control", _array(result.control[0, at]), None),
             along=_array(along),
             value=None if optimum is None else _array(optimum(points)),
             estimate=None if estimate is None else _array(estimate),
             grid=_levels(optimum, reach, x) if plane and optimum is not None else None,
             relative=True,
         )
-
-
-def _curves(result: LoopResult, at: np.ndarray) -> Curves:
-    """Return the critic's weights, or the control of a policy that has none.
-
-    Ideal weights are not shown: the critic learns from the Bellman error, and where the ball shrinks with the
-    state K^-1 V(c) grows beyond all bounds.
-    """
-    critic = result.critic_weights[0, at]
-    if critic.shape[-1] == 0:
-        return Curves("control", _array(result.control[0, at]), None)
-    return Curves("weights of the critic", _array(critic), None)
 
 
 def _inner(controller: Controller) -> Controller:
@@ -169,11 +157,12 @@ def _moving(controller: Controller) -> StaFBasis | None:
     """Return kernel and centers of what follows the state in a controller."""
     from .. import adp
 
-    inner, basis = _inner(controller), None
-    if isinstance(inner, adp.Feedback):
-        basis = getattr(inner.policy, "basis", None)
-    elif isinstance(inner, adp.ActorCritic):
-        value = inner.basis.basis if isinstance(inner.basis, adp.LeadingCoordinates) else inner.basis
+    basis: object = None
+    if isinstance(controller, adp.Feedback):
+        basis = getattr(controller.policy, "basis", None)
+    elif isinstance(controller, adp.ActorCritic):
+        value = controller.basis
+        value = value.basis if isinstance(value, adp.LeadingCoordinates) else value
         basis = value.basis if isinstance(value, adp.StaFValueBasis) else None
     return basis if isinstance(basis, StaFBasis) else None
 
@@ -182,12 +171,12 @@ def _estimate(controller: Controller, points: Tensor, x: Tensor, critic: Tensor)
     """Return V^(y; x) at points y (F, S, n) around the states x (F, n)."""
     from .. import adp
 
-    inner = _inner(controller)
-    if isinstance(inner, adp.ActorCritic):
-        around = x.unsqueeze(-2).expand(points.shape)
-        estimate: Tensor = (inner.basis(points, around) * critic.unsqueeze(-2)).sum(-1)
-        return estimate
-    return inner.value(points, {})
+    if not isinstance(controller, adp.ActorCritic):
+        return controller.value(points, {})
+    estimate: Tensor = (
+        controller.basis(points, x.unsqueeze(-2).expand(points.shape)) * critic.unsqueeze(-2)
+    ).sum(-1)
+    return estimate
 
 
 def _across(path: Tensor, at: np.ndarray, radius: Tensor) -> tuple[Tensor, Tensor]:

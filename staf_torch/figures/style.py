@@ -299,16 +299,13 @@ def _short_decades(figure: Figure) -> None:
     """Name 1, 2 and 5 of a logarithmic axis of at most two decades, plainly: matplotlib's names overlap."""
     from matplotlib.ticker import FuncFormatter, LogFormatterSciNotation
 
-    def digit(value: float) -> str:
-        return f"{value:e}"[0]
-
     for axes in figure.axes:
         for axis in (axes.xaxis, axes.yaxis):
             low, high = sorted(map(abs, axis.get_view_interval()))
             if axis.get_scale() != "log" or not 1e-4 <= low <= high <= 1e5:
                 continue
             decades, inside = (
-                [digit(at) for at in axis.get_ticklocs(minor=minor) if low <= at <= high]
+                [f"{at:e}"[0] for at in axis.get_ticklocs(minor=minor) if low <= at <= high]
                 for minor in (False, True)
             )
             if len(decades) > 2 or not isinstance(axis.get_minor_formatter(), LogFormatterSciNotation):
@@ -316,7 +313,7 @@ def _short_decades(figure: Figure) -> None:
             inside += decades
             choices = ("125", "12357", "123456789")
             wanted = next((each for each in choices if sum(at in each for at in inside) > 1), choices[-1])
-            names = FuncFormatter(lambda at, _, wanted=wanted: f"{at:g}" if digit(at) in wanted else "")
+            names = FuncFormatter(lambda at, _, wanted=wanted: f"{at:g}" if f"{at:e}"[0] in wanted else "")
             axis.set_major_formatter(names)
             axis.set_minor_formatter(names)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -21,7 +21,6 @@ from .style import at_left, colour, dash, legend, marker, panels, ticks
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
-    from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
 
 KERNEL, RADIUS, COUNT, SEED = "kernel", "centers.radius", "centers.count", "seed"
@@ -126,12 +125,14 @@ def cost_against_accuracy(found: Collection) -> list[Panel]:
     if len({_work(run, by_count) for run in runs}) < 2:
         return []
     of_radius = _several(runs, RADIUS) and len({_law(run) for run in runs}) == 1
-    named = _radius if of_radius else _law
     inside = (*_OF_COST, RADIUS) if of_radius else _OF_COST
     panels = []
     for title, group in _panels(found, runs, inside):
         order = (lambda run: run.setting(RADIUS)) if of_radius else _law
-        curves = [Curve(named(line[0]), _costs(line, by_count)) for _, line in _split(group, order)]
+        curves = [
+            Curve(f"$r$ = {value:g}" if of_radius else str(value), _costs(line, by_count))
+            for value, line in _split(group, order)
+        ]
         panels.append(Panel(title, tuple(curves)))
     return panels
 
@@ -139,10 +140,6 @@ def cost_against_accuracy(found: Collection) -> list[Panel]:
 def _law(run: RecordedRun) -> str:
     law, predictor = (str(run.setting(key)).replace("_", " ") for key in ("optimizer", "predictor"))
     return law if predictor in ("none", "None") else f"{law}, {predictor} predictor"
-
-
-def _radius(run: RecordedRun) -> str:
-    return f"$r$ = {run.setting(RADIUS):g}"
 
 
 def _work(run: RecordedRun, by_count: bool) -> float:
@@ -196,7 +193,7 @@ def _title(run: RecordedRun, keys: Sequence[str]) -> str:
 
 def _split(
     runs: Sequence[RecordedRun], key: Callable[[RecordedRun], object]
-) -> list[tuple[object, list[RecordedRun]]]:
+) -> list[tuple[Any, list[RecordedRun]]]:
     """By a key: numbers in order, then the others as they came."""
     return sorted(grouped(runs, key).items(), key=lambda item: rank(item[0]))  # type: ignore[arg-type]
 
@@ -250,25 +247,6 @@ def draw_cost_against_accuracy(shown_panels: Sequence[Panel], work: str = "produ
     return figure
 
 
-def _lines(axes: Axes, shown: Panel) -> None:
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    axes.set_title(shown.title, loc="left")
-    for i, curve in enumerate(shown.curves):
-        x = [point.x for point in curve.points]
-        (line,) = axes.plot(x, [point.middle for point in curve.points], color=colour(i), label=curve.label)
-        line.set(marker=marker(i), markersize=3.5, linestyle=dash(i))
-        if any(point.low < point.high for point in curve.points):
-            low, high = [point.low for point in curve.points], [point.high for point in curve.points]
-            axes.fill_between(x, low, high, color=colour(i), alpha=0.2, linewidth=0)
-        if curve.floor:
-            floor = [point.middle for point in curve.floor]
-            (dots,) = axes.plot(
-                [point.x for point in curve.floor], floor, ":", color=colour(i), linewidth=0.9
-            )
-            dots.set_label("_" if i else _IDEAL)
-
-
 @contextlib.contextmanager
 def _errors(shown_panels: Sequence[Panel]) -> Iterator[tuple[Figure, list[Axes]]]:
     """Yield a page with the lines of all panels; in the end it gets limits and one legend."""
@@ -276,11 +254,23 @@ def _errors(shown_panels: Sequence[Panel]) -> Iterator[tuple[Figure, list[Axes]]
     from matplotlib.patches import Patch
 
     labels = [curve.label for curve in shown_panels[0].curves]
-    more = [_IDEAL, "rounding of V", "95 % over seeds"]
+    more, visible = [_IDEAL, "rounding of V", "95 % over seeds"], False
     spare = labels + more if len(shown_panels) > 1 else ()
     with panels(len(shown_panels), _COLUMNS, spare=spare, sharey=True) as (figure, grid):
         for axes, shown in zip(grid, shown_panels, strict=True):
-            _lines(axes, shown)
+            axes.set(xscale="log", yscale="log")
+            axes.set_title(shown.title, loc="left")
+            for i, curve in enumerate(shown.curves):
+                x, middle, low, high = np.reshape(curve.points, (-1, 4)).T
+                look = {"color": colour(i), "marker": marker(i), "markersize": 3.5, "linestyle": dash(i)}
+                axes.plot(x, middle, label=curve.label, **look)
+                if (low < high).any():
+                    axes.fill_between(x, low, high, color=colour(i), alpha=0.2, linewidth=0)
+                visible |= any(point.high > _VISIBLE * point.low for point in curve.points)
+                if curve.floor:
+                    x, middle, _, _ = np.array(curve.floor).T
+                    label = "_" if i else _IDEAL
+                    axes.plot(x, middle, ":", color=colour(i), linewidth=0.9, label=label)
         yield figure, grid
         _label_left(grid)
         drawn = _drawn(grid)
@@ -291,7 +281,7 @@ def _errors(shown_panels: Sequence[Panel]) -> Iterator[tuple[Figure, list[Axes]]
             lines[_IDEAL] = Line2D([], [], color="0.4", linestyle=":", linewidth=0.9, label=_IDEAL)
         handles = [line for label, line in lines.items() if not label.startswith("_")]
         handles.sort(key=lambda line: line.get_marker() == "None")  # type: ignore[attr-defined]
-        if any(point.high > _VISIBLE * point.low for point in _points_of(shown_panels)):
+        if visible:
             handles.append(Patch(color="0.4", alpha=0.25, linewidth=0, label="95 % over seeds"))
         legend(*grid, handles=handles)
 
@@ -302,10 +292,6 @@ def _drawn(grid: Sequence[Axes]) -> list[float]:
     numbers = [(line, y) for line in lines for y in np.asarray(line.get_ydata(), float) if np.isfinite(y)]
     least = min(y for line, y in numbers if line.get_marker() != "None")
     return [y for _, y in numbers if y >= _FAR * least]
-
-
-def _points_of(panels: Sequence[Panel]) -> list[Point]:
-    return [point for shown in panels for curve in shown.curves for point in curve.points]
 
 
 def draw_heat_maps(maps: Sequence[HeatMap]) -> Figure:
@@ -321,7 +307,13 @@ def draw_heat_maps(maps: Sequence[HeatMap]) -> Figure:
             axes.set_facecolor("0.92")
             image = axes.imshow(values, norm=norm, cmap="viridis", origin="lower", aspect="auto")
             axes.grid(False)
-            _numbers(axes, values, norm)
+            for (row, column), error in np.ndenumerate(values):
+                text, shade = "-", "0.3"
+                if np.isfinite(error):  # two digits, no plus or zero in the exponent: a cell is narrow
+                    mantissa, _, power = f"{error:.1e}".partition("e")
+                    text = f"{error:.2g}" if 0.01 <= error < 1000 else f"{mantissa}e{int(power)}"
+                    shade = "white" if float(norm(error)) < 0.6 else "black"  # on dark and light colours
+                axes.text(column, row, text, ha="center", va="center", color=shade)
             axes.set_xticks(range(len(shown.radii)), [f"{radius:g}" for radius in shown.radii])
             axes.set_yticks(range(len(shown.counts)), [str(count) for count in shown.counts])
             axes.tick_params(length=0)
@@ -332,48 +324,31 @@ def draw_heat_maps(maps: Sequence[HeatMap]) -> Figure:
     return figure
 
 
-def _numbers(axes: Axes, values: np.ndarray, norm: LogNorm) -> None:
-    """Each cell's error, white on dark and black on light colours."""
-    for (row, column), error in np.ndenumerate(values):
-        lost = not np.isfinite(error)
-        shade = "0.3" if lost else "white" if float(norm(error)) < 0.6 else "black"
-        axes.text(column, row, "-" if lost else _short(error), ha="center", va="center", color=shade)
-
-
-def _short(error: float) -> str:
-    """Two digits without a plus or a zero in the exponent: a cell is narrow."""
-    mantissa, _, exponent = f"{error:.1e}".partition("e")
-    return f"{error:.2g}" if 0.01 <= error < 1000 else f"{mantissa}e{int(exponent)}"
-
-
 def _label_left(grid: Sequence[Axes], label: str = _ERROR) -> None:
     for axes in grid:
         if at_left(axes):
             axes.set_ylabel(label)
 
 
-def radius_figure(found: Collection) -> Figure | None:
-    """Draw `error_against_radius` of a sweep; None where the radius was not swept."""
+def _radius_figure(found: Collection) -> Figure | None:
     panels = error_against_radius(found)
     return draw_error_against_radius(panels, rounding_floor(found)) if panels else None
 
 
-def map_figure(found: Collection) -> Figure | None:
-    """Draw `heat_maps` of a sweep; None where radius and count were not both swept."""
+def _map_figure(found: Collection) -> Figure | None:
     maps = heat_maps(found)
     return draw_heat_maps(maps) if maps else None
 
 
-def cost_figure(found: Collection) -> Figure | None:
-    """Draw `cost_against_accuracy` of a sweep; None where nothing that costs was swept."""
+def _cost_figure(found: Collection) -> Figure | None:
     panels = cost_against_accuracy(found)
     work = "multiplications" if _several(found.rows, COUNT) else "products with $K$"
     return draw_cost_against_accuracy(panels, work) if panels else None
 
 
 SWEEP_FIGURES: dict[str, tuple[str, Callable[[Collection], Figure | None]]] = {
-    "error_against_radius": ("Error against the radius", radius_figure),
-    "error_map": ("Error over radius and number of centers", map_figure),
-    "cost_against_accuracy": ("Cost against accuracy", cost_figure),
+    "error_against_radius": ("Error against the radius", _radius_figure),
+    "error_map": ("Error over radius and number of centers", _map_figure),
+    "cost_against_accuracy": ("Cost against accuracy", _cost_figure),
 }
-"""By the name of the file: what a figure shows, and the function that draws it."""
+"""By the name of the file: what a figure shows, and the function that draws it; None where not swept."""

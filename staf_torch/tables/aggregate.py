@@ -22,10 +22,6 @@ _SERIES = 200  # degrees of freedom from which the expansion is more accurate th
 _MOST = 6  # metrics that a table shows where none is declared a headline
 _NAMED = 3  # runs without a result that a note names
 _SEED = "seed"
-_ONE_STATE = (
-    ": it draws the initial states of all trajectories but the first, and there was one. "
-    "With `trajectories=4` three are drawn."
-)
 _ASCENDING, _DESCENDING = ":asc", ":desc"
 
 
@@ -175,13 +171,7 @@ def _without_effect(found: Collection) -> Iterator[str]:
             there.add(metrics)
         compared = [group for group in groups.values() if len(group[0]) > 1]
         if compared and all(len(metrics) == 1 for _, metrics in compared):
-            said = f"`{key}` was swept and changed no metric in any row"
-            yield f"{said}{_ONE_STATE if key == _SEED and _starts_alone(found.rows) else '.'}"
-
-
-def _starts_alone(runs: Sequence[RecordedRun]) -> bool:
-    """Return whether the runs are chases of a single trajectory each, which begins at `initial_state`."""
-    return all(run.task == "gradient_chase" and run.setting("trajectories") == 1 for run in runs)
+            yield f"`{key}` was swept and changed no metric in any row."
 
 
 def _check(found: Collection, layout: Layout) -> None:
@@ -284,29 +274,20 @@ def _row(
         lost[column.name] = mean([lost_share(run, column.metric) for run in here])
         cells[column.name] = AGGREGATES[column.statistic](numbers) if numbers else None
         if cells[column.name] is None:
-            reasons[column.name] = _why(here, column.metric)
-    cells["reasons"] = "; ".join(dict.fromkeys(_absences(runs, columns))) or None
+            absent = dict.fromkeys(
+                run.absence(column.metric) for run in here if run.metrics.get(column.metric) is None
+            )
+            several = "needs two runs or more" if here else "there is no such run"
+            reasons[column.name] = "; ".join(absent) or several
+    metrics = dict.fromkeys(column.metric for column in columns if column.metric is not None)
+    missing = (run.absence(metric) for run in runs for metric in metrics if run.metrics.get(metric) is None)
+    cells["reasons"] = "; ".join(dict.fromkeys(missing)) or None
     return Row(cells, reasons, lost)
 
 
 def lost_share(run: RecordedRun, metric: str) -> float:
     """Return the share of a run's trajectories that a metric does not speak of: 1 where it is missing."""
     return 1.0 if run.metrics.get(metric) is None else run.metrics.get("diverged_fraction") or 0.0
-
-
-def _why(runs: Sequence[RecordedRun], metric: str) -> str:
-    if not runs:
-        return "there is no such run"
-    absent = dict.fromkeys(run.absence(metric) for run in runs if run.metrics.get(metric) is None)
-    return "; ".join(absent) or "needs two runs or more"
-
-
-def _absences(runs: Sequence[RecordedRun], columns: Sequence[Column]) -> Iterator[str]:
-    metrics = dict.fromkeys(column.metric for column in columns if column.metric is not None)
-    for run in runs:
-        for metric in metrics:
-            if run.metrics.get(metric) is None:
-                yield run.absence(metric)
 
 
 def _notes(runs: Sequence[RecordedRun]) -> Iterator[str]:
@@ -330,9 +311,14 @@ def _sorted(table: Table, names: Sequence[str]) -> list[Row]:
 
 def in_order(items: Sequence[T], value: Callable[[T], Value], *, descending: bool) -> list[T]:
     """Return items by a value: numbers before texts, what is missing last in either direction."""
-    present = [item for item in items if _there(value(item))]
-    present.sort(key=lambda item: _key(value(item)), reverse=descending)
-    return present + [item for item in items if not _there(value(item))]
+
+    def key(item: T) -> tuple[bool, float, str]:
+        found = value(item)
+        return (False, float(found), "") if isinstance(found, int | float) else (True, 0.0, str(found))
+
+    missing = [item for item in items if value(item) is None or value(item) != value(item)]  # None or NaN
+    present = [item for item in items if value(item) is not None and value(item) == value(item)]
+    return sorted(present, key=key, reverse=descending) + missing
 
 
 def _column(table: Table, name: str) -> tuple[str, bool]:
@@ -341,12 +327,3 @@ def _column(table: Table, name: str) -> tuple[str, bool]:
         if name in (column.name, column.metric):
             return column.name, column.larger_is_better
     raise fail(TABLE_COMMAND, "sort", _one_of(table.names, name), name)
-
-
-def _there(value: Value) -> bool:
-    return value is not None and not (isinstance(value, float) and math.isnan(value))
-
-
-def _key(value: Value) -> tuple[bool, float, str]:
-    number = isinstance(value, int | float)
-    return (False, float(value), "") if number else (True, 0.0, str(value))  # type: ignore[arg-type]

@@ -21,7 +21,6 @@ from ..results.files import visible
 from ..results.reader import Value
 from ..results.run import CLASS_PATH, class_name
 
-_Cells = tuple["Number | str | None", ...]
 _SPREADS = ("std", "ci95")
 _COUNTS = ("n", "failed")
 
@@ -110,20 +109,15 @@ def show(number: Number, digits: int) -> str:
     return text if number.spread is None else f"{text} ± {significant(number.spread, 2)}"
 
 
-def _classes(name: str, cells: _Cells) -> _Cells:
-    """Return what a setting such as `kernel.path` names without the modules, where the classes differ."""
-    if not name.endswith(CLASS_PATH):
-        return cells
-    short = {cell: class_name(cell) for cell in cells if isinstance(cell, str)}
-    unique = len(set(short.values())) == len(short)
-    return tuple(short[cell] if unique and isinstance(cell, str) else cell for cell in cells)
-
-
 def printed(columns: Sequence[Column], rows: Sequence[Row], style: Style) -> list[PrintedColumn]:
     """Return the columns as they are read."""
     found = []
     for column in columns:
-        cells = _classes(column.name, tuple(_cell(row.cells.get(column.name)) for row in rows))
+        cells = tuple(_cell(row.cells.get(column.name)) for row in rows)
+        if column.name.endswith(CLASS_PATH):  # the classes without the modules, where these differ
+            short = {cell: class_name(cell) for cell in cells if isinstance(cell, str)}
+            if len(set(short.values())) == len(short):
+                cells = tuple(short[cell] if isinstance(cell, str) else cell for cell in cells)
         if column.shown and column.statistic is None:
             best = _best(cells, column, rows, style)
             name = "" if column.heading else column.name
@@ -155,7 +149,13 @@ def _aggregated(columns: Sequence[Column], rows: Sequence[Row], style: Style) ->
             joined = spread if column.statistic == "mean" else None
             what = "" if single and column.statistic == "mean" else str(column.statistic)
             what = f"mean ± {joined.statistic}" if joined is not None else what
-            cells = tuple(_joined(row.cells, column, joined) for row in rows)
+            cells = tuple(map(_cell, (row.cells.get(column.name) for row in rows)))
+            if joined is not None:
+                widths = [row.cells.get(joined.name) for row in rows]
+                cells = tuple(
+                    Number(cell.value, w) if isinstance(cell, Number) and isinstance(w, int | float) else cell
+                    for cell, w in zip(cells, widths, strict=True)
+                )
             alone = at and len(shown) == 1  # the statistic joins the heading above
             heading = ", ".join(filter(None, (at or metric, "" if alone else what)))
             over = ", ".join(filter(None, (metric, what if alone else ""))) if at else ""
@@ -164,27 +164,17 @@ def _aggregated(columns: Sequence[Column], rows: Sequence[Row], style: Style) ->
             )
 
 
-def _joined(cells: Mapping[str, Value], column: Column, spread: Column | None) -> Number | None:
-    value = cells.get(column.name)
-    if not isinstance(value, int | float):
-        return None
-    width = cells.get(spread.name) if spread is not None else None
-    return Number(value, width if isinstance(width, int | float) else None)
-
-
 def _counts(columns: Sequence[Column], rows: Sequence[Row]) -> Iterator[PrintedColumn]:
     """Over how many runs a number of the row is, `4-5` where they differ, and how many runs gave none."""
     for count in _COUNTS:
         names = [column.name for column in columns if column.statistic == count]
-        cells = tuple(_range([row.cells[name] for name in names]) for row in rows)
+        cells: list[Number | str] = []
+        for row in rows:
+            whole = [number for name in names if isinstance(number := row.cells[name], int)]
+            least, most = min(whole), max(whole)
+            cells.append(Number(least) if least == most else f"{least}-{most}")
         if count == "n" or any(cell != Number(0) for cell in cells):
-            yield PrintedColumn(count, "", cells, name=count)
-
-
-def _range(counts: Sequence[Value]) -> Number | str:
-    whole = [count for count in counts if isinstance(count, int)]
-    least, most = min(whole), max(whole)
-    return Number(least) if least == most else f"{least}-{most}"
+            yield PrintedColumn(count, "", tuple(cells), name=count)
 
 
 def _best(
@@ -326,14 +316,13 @@ def json_text(table: Table) -> str:
 
         Shown by `staf-table runs --format json`.
     """
-    content = [_json_row(table.names, row) for row in table.rows]
+    content = []
+    for row in table.rows:
+        lost = {n: v for n, v in row.cells.items() if isinstance(v, float) and not math.isfinite(v)}
+        why = {name: f"{value!r} is not a JSON number" for name, value in lost.items()}
+        cells: dict[str, Any] = {**dict.fromkeys(table.names), **row.cells, **dict.fromkeys(lost)}
+        content.append(cells | {"reasons": {**row.reasons, **why}})
     return dumps(content, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
-
-
-def _json_row(names: Sequence[str], row: Row) -> dict[str, Any]:
-    lost = {n: v for n, v in row.cells.items() if isinstance(v, float) and not math.isfinite(v)}
-    reasons = {**row.reasons, **{name: f"{value!r} is not a JSON number" for name, value in lost.items()}}
-    return {**dict.fromkeys(names), **row.cells, **dict.fromkeys(lost), "reasons": reasons}
 
 
 def parquet_bytes(table: Table) -> bytes:

@@ -32,7 +32,7 @@ def test_a_study_has_a_row_metrics_and_a_line_a_method(
     study = Study("both", columns, ("a_b",), logging.getLogger("staf_torch.test"), digits=5)
     study.add("", {"a_b": 1.23456789, "c": None}, {"time": 3.0}, method="mine")
     study.add("other_", {"a_b": math.inf, "c": 2.0}, method="other")
-    found = study.write(RunDirectory(tmp_path), None)
+    found = study.write(settings("figures=false"), RunDirectory(tmp_path), pytest.fail)
     assert found == {"a_b": 1.23456789, "c": None, "other_a_b": None, "other_c": 2.0}
     assert caplog.messages[0] == "mine: a b 1.2346"
     assert {path.name for path in tmp_path.iterdir()} == {"both.csv", "both.md", "metrics.json"}

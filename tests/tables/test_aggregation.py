@@ -184,10 +184,6 @@ def test_a_setting_without_effect_is_told() -> None:
     assert swept(lambda a, b: 1.0 * b) == (told("a"),)
     assert swept(lambda a, b: 1.0) == (told("a"), told("b"))
     assert swept(lambda a, b: 1.0 * a * b) == swept(lambda a, b: float(a == b == 2)) == ()
-    chases = [run(k, {"cost": 1.0}, seed=k, trajectories=1, task="gradient_chase") for k in (0, 1)]
-    (said,) = tabulate(of(*chases)).notes
-    assert said.startswith(told("seed")[:-1])
-    assert "`trajectories=4`" in said
     apart = of(run(0, {"cost": 1.0}, a=1, b=1), run(1, {"cost": 1.0}, a=2, b=2))  # nothing to compare
     assert tabulate(apart).notes == ()
     assert tabulate(of(run(0, {"cost": 1.0}, a=1), run(1, {}, a=2))).notes == ()
