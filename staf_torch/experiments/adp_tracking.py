@@ -135,12 +135,10 @@ def _drawn(results: dict[str, LoopResult], parameters: Tensor, theta: Tensor) ->
         return rows[0].cpu().numpy()
 
     shown = results["identified"]
-    errors = {
-        name: torch.where(
-            one.time.to(one.frozen_at) > one.frozen_at[0], torch.nan, one.state[0, :, :2].norm(dim=-1)
-        )
-        for name, one in results.items()
-    }
+    errors = {}
+    for name, one in results.items():
+        diverged = one.time.to(one.frozen_at) > one.frozen_at[0]
+        errors[name] = torch.where(diverged, torch.nan, one.state[0, :, :2].norm(dim=-1))
     return TrackingHistory(
         time=shown.time.numpy(),
         state=first(shown.state),

@@ -44,13 +44,9 @@ class Vehicle(NamedTuple):
 
 def _mass(cfg: DictConfig, dt: float, bound: float) -> Vehicle:
     """p'' = u under its LQR."""
-    matrix, push = (
-        torch.zeros(4, 4, dtype=torch.float64, device="cpu"),
-        torch.zeros(4, 2, dtype=torch.float64, device="cpu"),
-    )
-    matrix[0, 2] = matrix[1, 3] = push[2, 0] = push[3, 1] = 1.0
+    matrix, push = [[0, 0, 1, 0], [0, 0, 0, 1], [0] * 4, [0] * 4], [[0, 0], [0, 0], [1, 0], [0, 1]]
     cost = QuadraticCost(cfg.adp.q, cfg.adp.r, 4, 2, low=-bound, high=bound)
-    lqr = LQR(Linear(matrix.tolist(), push.tolist()), cost, period=dt)
+    lqr = LQR(Linear(matrix, push), cost, period=dt)
 
     def rate(x: Tensor, u: Tensor) -> Tensor:
         return torch.cat((x[..., 2:], u), dim=-1)
@@ -136,17 +132,8 @@ class AmongDiscs(ControlAffineSystem):
         return torch.stack([self.rate(x, unit.expand(*x.shape[:-1], 2)) - idle for unit in units], dim=-1)
 
 
-class Drives(NamedTuple):
-    """Closed loops in every scenario, with and without the filter."""
-
-    vehicle: Vehicle
-    radius: float  # m, of the discs
-    guard: SafetyFilter
-    results: dict[str, LoopResult]
-
-
-def drives(cfg: DictConfig) -> Drives:
-    """Run both methods in every scenario."""
+def drives(cfg: DictConfig) -> tuple[Vehicle, float, SafetyFilter, dict[str, LoopResult]]:
+    """Run both methods in every scenario: vehicle, radius of the discs (m), filter, and closed loops."""
     device, dtype = placement(cfg.device, cfg.dtype)
     chosen = cfg.avoidance
     animation_kind(cfg)  # refuses other values before anything takes time
@@ -175,7 +162,7 @@ def drives(cfg: DictConfig) -> Drives:
         name: Method(each, system, cost).run(x0, dt=dt, steps=steps, compile=cfg.adp.compile)
         for name, each in ((FILTERED, guard), (BARE, Feedback(wanted)))
     }
-    return Drives(vehicle, radius, guard, results)
+    return vehicle, radius, guard, results
 
 
 def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics:
@@ -207,7 +194,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
 
 
 run.animates = True  # type: ignore[attr-defined]
-run.held = lambda cfg: histories(drives(cfg).results)  # type: ignore[attr-defined]
+run.held = lambda cfg: histories(drives(cfg)[-1])  # type: ignore[attr-defined]
 
 
 def scenarios(cfg: DictConfig) -> Tensor:

@@ -117,7 +117,18 @@ def _run(
     """
     first, basis = members[0].problem, parts.basis
     times, starts = first.steps + 1, torch.cat([member.problem.initial_states for member in members])
-    metrics = _metrics(members, parts, rows, errors)
+    windows = [Member(m.rows, m.problem.dt, m.problem.settle_time) for m in members]
+    if rows.differ or errors is None:
+        states = sum(window.rows * max(0, times - window.first) for window in windows)
+        slower = 8 if rows.differ else 1  # in plain torch, for a state with numbers of its own
+        errors = StateErrorPass(basis, parts.target, expected=slower * states)
+    metrics = ChaseMetrics(
+        *(basis, parts.target, parts.law),
+        inner_steps=first.inner_steps,
+        members=windows,
+        own=first.metrics,
+        errors=errors,
+    )
     blocks, chunk = _pieces(
         starts, times, basis, jobs=len(members), kept=any(member.sink is not None for member in members)
     )
@@ -136,7 +147,12 @@ def _run(
                     metrics.add(result)
                     if not warned:
                         reach = torch.maximum(reach, _reach(basis, result.state))
-                    _distribute(result, done, time, members)
+                    start = -done  # of a member, from the first row of the piece
+                    for member in members:
+                        low, high = max(start, 0), min(start + member.rows, len(result.state))
+                        if low < high:
+                            member.take(result, slice(low, high), low - start, time)
+                        start += member.rows
                     time += result.state.shape[1]
                     done_times += result.state.shape[0] * result.state.shape[1]
                     whole = done_times * len(members) // len(starts)  # times of whole problems, for progress
@@ -151,27 +167,6 @@ def _run(
         basis.warn_reach(float(reach.max()), stacklevel=2)
     found = zip(members, metrics.summaries(), reach.split([member.rows for member in members]), strict=True)
     return [member.outcome(summary, float(own.max()), alone=alone) for member, summary, own in found]
-
-
-def _metrics(
-    members: Sequence[_BatchMember], parts: _Objects, rows: RowsOfJobs, errors: StateErrorPass | None
-) -> ChaseMetrics:
-    """Metrics of problems that are one batch; arguments are those of `_run`."""
-    first = members[0].problem
-    windows = [Member(m.rows, m.problem.dt, m.problem.settle_time) for m in members]
-    if rows.differ or errors is None:
-        states = sum(window.rows * max(0, first.steps + 1 - window.first) for window in windows)
-        slower = 8 if rows.differ else 1  # in plain torch, for a state with numbers of its own
-        errors = StateErrorPass(parts.basis, parts.target, expected=slower * states)
-    return ChaseMetrics(
-        parts.basis,
-        parts.target,
-        parts.law,
-        inner_steps=first.inner_steps,
-        members=windows,
-        own=first.metrics,
-        errors=errors,
-    )
 
 
 def _chased(first: ChaseProblem, parts: _Objects, starts: Tensor, chunk: int) -> Iterator[ChaseResult]:
@@ -218,16 +213,6 @@ def _reach(basis: StaFBasis, states: Tensor) -> Tensor:
         return states.new_zeros(len(states))
     reach = over_rows(lambda at: at.norm(dim=-1) * basis.centers.radius(at), states)
     return torch.where(torch.isfinite(reach), reach, 0.0).amax(1)
-
-
-def _distribute(result: ChaseResult, first: int, time: int, members: Sequence[_BatchMember]) -> None:
-    """Give every member what a piece has of its rows; the piece begins at row ``first`` of the batch."""
-    start, count = 0, result.state.shape[0]
-    for member in members:
-        low, high = max(start - first, 0), min(start + member.rows - first, count)
-        if low < high:
-            member.take(result, slice(low, high), first + low - start, time)
-        start += member.rows
 
 
 class _BatchMember:

@@ -143,22 +143,12 @@ def unstable(rows: int, generator: torch.Generator) -> FaultCase:
     at = 0.1 + 0.4 * torch.rand(rows, generator=generator, dtype=torch.float64, device="cpu")
     law = LeastSquares([1.0, 1.0], deviation=[0.3, 0.05], floor=1e-3, forgetting=0.2, alarm=5.0)
     windows = IntegralWindows(model, 0.06, noise=0.002)
-    before = torch.ones(rows, 2, dtype=torch.float64, device="cpu")
-    return FaultCase(
-        *(
-            model,
-            cost,
-            x0,
-            before,
-            before * torch.tensor([0.5, 1.0], device="cpu").to(before),
-            at,
-            0.02,
-            0.002,
-            0.05,
-        ),
-        AdaptiveLQR(model, cost, windows, law),
-        lambda: None,
+    before, after = (
+        torch.tensor([each], dtype=torch.float64, device="cpu").repeat(rows, 1)
+        for each in ([1.0, 1.0], [0.5, 1.0])
     )
+    adaptive = AdaptiveLQR(model, cost, windows, law)
+    return FaultCase(model, cost, x0, before, after, at, 0.02, 0.002, 0.05, adaptive, lambda: None)
 
 
 def mass(rows: int, generator: torch.Generator) -> FaultCase:

@@ -69,13 +69,10 @@ class Learning(NamedTuple):
         batch = self.states.shape[0]
         states = self.states.repeat(len(radii), 1, 1)
         each = rows(radii.repeat_interleave(batch))
-        columns = [
-            self.squares(rows(width.expand(len(states))), each, states)
-            .reshape(len(radii), batch)
-            .mean(1)
-            .sqrt()
-            for width in progress.each(list(widths), "widths of the grid")
-        ]
+        columns = []
+        for width in progress.each(list(widths), "widths of the grid"):
+            squares = self.squares(rows(width.expand(len(states))), each, states)
+            columns.append(squares.reshape(len(radii), batch).mean(1).sqrt())
         return torch.stack(columns, dim=1)
 
 
@@ -87,13 +84,12 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     problem = problem_of(cfg)
     widths, radii = (axis.to(problem.states) for axis in axes)
     path, errors = learn(problem, steps, rate, progress)
-    grid = problem.grid(widths, radii, progress)
+    grid, way = problem.grid(widths, radii, progress), path.exp()
     out = RunDirectory(directory)
     taken: list[dict[str, Value]] = [
         {"step": k, "width": float(w), "radius": float(r), "error": float(e)}
-        for k, ((w, r), e) in enumerate(zip(path.exp(), errors, strict=True))
+        for k, ((w, r), e) in enumerate(zip(way, errors, strict=True))
     ]
-    way = path.exp()
     numbers = [x.cpu().numpy() for x in (widths, radii, grid, way, errors)]
     picture = LearnedKernel(problem.name, *numbers)
     shown = Table.of(taken[:: -(-len(taken) // _SHOWN)])
@@ -171,13 +167,11 @@ def summary(path: Tensor, errors: Tensor, widths: Tensor, radii: Tensor, grid: T
 def _ratios(cfg: DictConfig, name: str) -> Tensor:
     """The numbers of an axis of the grid, equal ratios apart."""
     stated = cfg.learn_kernel[name]
+    group = f"learn_kernel.{name}"
     low, high = (
-        positive_real(COMMAND_LINE, f"learn_kernel.{name}.{end}", stated[end])
-        for end in ("smallest", "largest")
+        positive_real(COMMAND_LINE, f"{group}.{end}", stated[end]) for end in ("smallest", "largest")
     )
     if low >= high:
-        raise fail(
-            COMMAND_LINE, f"learn_kernel.{name}.largest", f"must be above the smallest ({low:g})", high
-        )
-    count = integer(COMMAND_LINE, f"learn_kernel.{name}.count", stated.count, least=2)
+        raise fail(COMMAND_LINE, f"{group}.largest", f"must be above the smallest ({low:g})", high)
+    count = integer(COMMAND_LINE, f"{group}.count", stated.count, least=2)
     return torch.logspace(math.log10(low), math.log10(high), count, dtype=torch.float64, device="cpu")

@@ -54,7 +54,10 @@ class BoxProblem(NamedTuple):
         for what, x in self.starts.items():
             steps, every = self.times[what]
             every = 1 if what and method.plant is not self.box else every
-            found[what] = _run(cfg, method, self.box, x.to(self.dtype), steps, every)
+            x = x.to(self.dtype)
+            start = self.box.transform(x.double()).to(x) if method.plant is self.box else x
+            shared = {"dt": float(cfg.dt), "steps": steps, "every": every, "compile": cfg.adp.compile}
+            found[what] = method.run(start, **shared, seed=seed_of(cfg))
         return found
 
 
@@ -144,13 +147,6 @@ def methods(cfg: DictConfig, box: Barrier, cost: Cost) -> dict[str, Method]:
         found["LQR of x, filtered"] = Method(guard, system, paid)
     found["LQR of x"] = Method(Feedback(lqr), system, paid)
     return found
-
-
-def _run(cfg: DictConfig, method: Method, box: Barrier, x0: Tensor, steps: int, every: int) -> LoopResult:
-    """Run one method from states x of the box; every ``every``-th step is recorded."""
-    start = box.transform(x0.double()).to(x0) if method.plant is box else x0
-    shared = {"dt": float(cfg.dt), "steps": steps, "every": every, "compile": cfg.adp.compile}
-    return method.run(start, **shared, seed=seed_of(cfg))
 
 
 def _measured(result: LoopResult, margin: Tensor, best: float | None) -> Metrics:

@@ -131,8 +131,8 @@ def _scene(controller: Controller, result: LoopResult, at: np.ndarray, optimum: 
             state=_array(x[:, :2]),
             centers=_array(centers),
             radius=_array(radius),
-            # No ideal weights: the critic learns from the Bellman error, and K^-1 V(c) grows beyond all bounds
-            # where the ball shrinks with the state.
+            # No ideal weights: the critic learns from the Bellman error, and where the ball shrinks with the
+            # state K^-1 V(c) grows beyond all bounds.
             curves=Curves("weights of the critic", _array(critic), None)
             if critic.shape[-1]
             else Curves("control", _array(result.control[0, at]), None),
@@ -173,9 +173,8 @@ def _estimate(controller: Controller, points: Tensor, x: Tensor, critic: Tensor)
 
     if not isinstance(controller, adp.ActorCritic):
         return controller.value(points, {})
-    estimate: Tensor = (
-        controller.basis(points, x.unsqueeze(-2).expand(points.shape)) * critic.unsqueeze(-2)
-    ).sum(-1)
+    around = x.unsqueeze(-2).expand(points.shape)
+    estimate: Tensor = (controller.basis(points, around) * critic.unsqueeze(-2)).sum(-1)
     return estimate
 
 

@@ -81,8 +81,7 @@ class Print:
 def latex_text(table: Table, about: Print | None = None) -> str:
     r"""Return the table; the document needs `\usepackage{booktabs}`, and `textcomp` before LaTeX of 2020.
 
-    A column whose numbers are those of one before it, as printed, is left out; this, and why runs have no
-    result, stands below the table as comments.
+    Why runs have no result stands below the table as comments.
 
     Example:
         >>> done = sweep("centers.radius=0.1,0.2", "duration=0.1", "settle_time=0", "figures=false")
@@ -118,8 +117,13 @@ def parts(table: Table, split: str | None) -> Iterator[tuple[str, Table]]:
 
 
 def _one(table: Table, about: Print, part: str) -> str:
-    columns, comments, runs = _needed(table)
-    digits = table.style.digits
+    columns, comments, runs, digits = [], list[str](), "", table.style.digits
+    for column in table.printed():
+        first = column.cells[0] if column.cells else None
+        if column.name == "n" and isinstance(first, Number) and set(column.cells) == {first}:
+            runs = f" of {first.value:g} runs"
+        else:
+            columns.append(column)
     align = "".join("r" if column.numeric else "l" for column in columns)
     rows = [
         " & ".join(_cell(c, row, digits, about.rename) for c in columns) for row in range(len(table.rows))
@@ -146,7 +150,8 @@ def _one(table: Table, about: Print, part: str) -> str:
     if about.caption is None:
         comments = [meaning, *comments] if meaning else comments
     else:
-        label = [] if about.label is None else [rf"\label{{{_label(about.label, part)}}}"]
+        value = re.sub(r"[^A-Za-z0-9.:-]", "-", part.partition("=")[2])  # a run's text is nobody's LaTeX
+        label = [] if about.label is None else [rf"\label{{{about.label}{f'-{value}' if part else ''}}}"]
         caption = f"{about.caption} {meaning}".strip()
         name = "table*" if about.wide else "table"
         begin = [rf"\begin{{{name}}}", r"\centering", rf"\caption{{{caption}}}", *label]
@@ -159,38 +164,6 @@ def _width(column: PrintedColumn, digits: int, rename: Mapping[str, str]) -> flo
     texts = [_name(column, rename), *(_cell(column, row, digits, rename) for row in range(len(column.cells)))]
     hidden = re.compile(r"\\(boldmath|textbf)|[${}^_\\,]|(?<=\\)[a-z]+")
     return _LETTER * max(len(hidden.sub("", text)) for text in texts)
-
-
-def _label(label: str, part: str) -> str:
-    value = re.sub(r"[^A-Za-z0-9.:-]", "-", part.partition("=")[2])  # a run's text is nobody's LaTeX
-    return f"{label}-{value}" if part else label
-
-
-def _needed(table: Table) -> tuple[list[PrintedColumn], list[str], str]:
-    """Return the columns but those that only repeat another, what to say of these, and the runs a row."""
-    kept: list[PrintedColumn] = []
-    said: list[str] = []
-    runs = ""
-    for column in table.printed():
-        first = column.cells[0] if column.cells else None
-        if column.name == "n" and isinstance(first, Number) and set(column.cells) == {first}:
-            runs = f" of {first.value:g} runs"
-            continue
-        texts = _texts(column, table.style.digits)
-        same = (other for other in kept if other.metric and _texts(other, table.style.digits) == texts)
-        other = next(same, None) if column.metric and len(texts) > 1 else None
-        if other is None:
-            kept.append(column)
-        else:
-            said.append(f"{column.name} is {other.name} to the digits printed.")
-    return kept, said, runs
-
-
-def _texts(column: PrintedColumn, digits: int) -> list[str]:
-    return [
-        _cell(dataclasses.replace(column, best=frozenset()), row, digits, {})
-        for row in range(len(column.cells))
-    ]
 
 
 def _cell(column: PrintedColumn, row: int, digits: int, rename: Mapping[str, str]) -> str:
@@ -248,11 +221,12 @@ def _headings(columns: Sequence[PrintedColumn], rename: Mapping[str, str]) -> li
 
 def _name(column: PrintedColumn, rename: Mapping[str, str]) -> str:
     """Return the heading of a column: the symbol, and which statistic it is where it is no mean."""
-    name = column.name or column.heading
-    written = rename.get(name) or (SYMBOLS[name][0] if name in SYMBOLS else escape(name))
-    return (
-        written if column.what in ("", "mean") or "±" in column.what else f"{written}, {escape(column.what)}"
-    )
+    written, what = _symbol(column.name or column.heading, rename), column.what
+    return written if what in ("", "mean") or "±" in what else f"{written}, {escape(what)}"
+
+
+def _symbol(name: str, rename: Mapping[str, str]) -> str:
+    return rename.get(name) or (SYMBOLS[name][0] if name in SYMBOLS else escape(name))
 
 
 def _heading(at: str, rename: Mapping[str, str]) -> str:
@@ -260,9 +234,8 @@ def _heading(at: str, rename: Mapping[str, str]) -> str:
     written = []
     for part in at.split(", "):
         name, equals, value = part.partition("=")
-        symbol = rename.get(name) or (SYMBOLS[name][0] if name in SYMBOLS else escape(name))
-        value = rename.get(value, escape(value))
-        written.append(f"{symbol}{' = ' if equals else ''}{value}")
+        shown = rename.get(value, escape(value))
+        written.append(f"{_symbol(name, rename)}{' = ' if equals else ''}{shown}")
     return ", ".join(written)
 
 

@@ -47,7 +47,7 @@ def test_rows_say_what_was_lost_violated_and_not_tried() -> None:
         Rival("absent", constant(0.0), ("no-such-package",)),
     ]
     rows = rivals.compare(SHORT, methods, tensor([[0.5, 0.0]]), calls=3)
-    assert [row.method for row in rows] == [method.name for method in methods]
+    assert [row[0] for row in rows] == [method.name for method in methods]
     best, unsuited, lost, loud, absent = (measured | more for _, measured, more in rows)
     assert (best["regulated"], best["violations"]) == (1, 0)
     assert 1 - 1e-9 <= best["ratio_median"] <= best["ratio_max"] < 1.1

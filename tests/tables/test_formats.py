@@ -145,14 +145,6 @@ def test_a_table_is_set_in_a_column_of_a_page_without_a_hand_edit(found: Collect
     assert "Overfull" not in said.stdout
 
 
-def test_a_column_that_only_repeats_another_is_left_out() -> None:
-    columns = (Column("a"), Column("m", "m"), Column("k", "k"))
-    rows = tuple(Row({"a": n, "m": 0.1 * n, "k": 0.1 * n + 1e-6}) for n in (1, 2))
-    text = latex_text(Table(columns, rows))
-    assert text.count(" & ") == 3  # a and m, of three lines
-    assert "% k is m to the digits printed." in text
-
-
 def test_latex_prints_every_special_character_as_it_is() -> None:
     special = "\\ { } $ & # ^ _ % ~ < > | \" ' ` -- [ ] *"
     expected = (
