@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import logging
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from .. import adp
 from ..adp import ConcurrentLearning, Controller, IdentifyingTracker, LoopResult, QuadraticCost
-from ..figures.closed_loop import TrackingHistory, draw_tracking
+from ..figures.closed_loop import draw_tracking
 from ..figures.style import draws, images
 from ..metrics.closed_loop import tracking_metrics
 from ..results.run_directory import RunDirectory
@@ -27,6 +27,9 @@ from .adp import recorded
 from .registry import Metrics
 from .scenes import tracking_scene, write_animation
 from .study import Method, histories, write_history
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _log = logging.getLogger(__name__)
 _HORIZON, _INTERVALS = 8.0, 160  # of direct shooting: the error has fallen to 1e-5 of itself
@@ -78,7 +81,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
         write_history(out, identified.time, recorded(identified) | {"parameters": parameters})
     write_animation(cfg, out, "tracking", lambda: tracking_scene(controllers["identified"], identified))
     if draws(cfg.figures):
-        out.figure("adp_tracking", images(draw_tracking(_drawn(results, parameters, plant.theta))))
+        out.figure("adp_tracking", images(_drawn(results, parameters, plant.theta)))
     return out.metrics(metrics)
 
 
@@ -128,8 +131,8 @@ def _controllers(cfg: DictConfig, plant: TwoStateTracking, cost: QuadraticCost) 
     }
 
 
-def _drawn(results: dict[str, LoopResult], parameters: Tensor, theta: Tensor) -> TrackingHistory:
-    """The first trajectory; |e| is NaN from where it diverged on."""
+def _drawn(results: dict[str, LoopResult], parameters: Tensor, theta: Tensor) -> Figure:
+    """Draw the first trajectory; |e| is NaN from where it diverged on."""
 
     def first(rows: Tensor) -> np.ndarray:
         return rows[0].cpu().numpy()
@@ -139,7 +142,7 @@ def _drawn(results: dict[str, LoopResult], parameters: Tensor, theta: Tensor) ->
     for name, one in results.items():
         diverged = one.time.to(one.frozen_at) > one.frozen_at[0]
         errors[name] = torch.where(diverged, torch.nan, one.state[0, :, :2].norm(dim=-1))
-    return TrackingHistory(
+    return draw_tracking(
         time=shown.time.numpy(),
         state=first(shown.state),
         errors={name: error.cpu().numpy() for name, error in errors.items()},

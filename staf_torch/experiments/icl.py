@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -11,7 +12,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from ..adp import ConcurrentTracker, LoopResult, Measured, ParametricPlant, QuadraticCost
-from ..figures.closed_loop import GainSets, draw_gain_sets
+from ..figures.closed_loop import draw_gain_sets
 from ..numerics.checks import COMMAND_LINE, fail, integer, non_negative, positive_real, real, vector
 from ..results.run_directory import RunDirectory
 from ..settings.chase import generator_of, placement, plain, seed_of
@@ -61,7 +62,8 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
         ours, theirs = (of[name].nan_to_num(math.inf, math.inf) for name in ("integral", "derivative"))
         study.metrics[f"integral_better_{what}"] = float((ours < theirs).double().mean())
     shown = int(rms["parameter_error"]["integral"].nan_to_num(math.inf, math.inf).argmin())
-    picture = GainSets(
+    drawing = partial(
+        draw_gain_sets,
         time=time.numpy(),
         parameters=thetas["integral"][shown].numpy(),
         truth=truth.numpy(),
@@ -69,7 +71,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
         parameter_error={name: values.numpy() for name, values in rms["parameter_error"].items()},
         followed={name: error[shown].norm(dim=-1).numpy() for name, error in errors.items()},
     )
-    return study.write(cfg, RunDirectory(directory), lambda: draw_gain_sets(picture))
+    return study.write(cfg, RunDirectory(directory), drawing)
 
 
 def loops(cfg: DictConfig) -> dict[str, LoopResult]:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ..approximation.basis import StaFBasis
 from ..centers import ConstantRadius, StateFollowingCenters, probe_points
-from ..figures.chase import LearnedKernel, draw_learned_kernel
+from ..figures.chase import draw_learned_kernel
 from ..kernels import Kernel
 from ..lanes import rows
 from ..local_basis import evaluate_scaled
@@ -91,9 +91,8 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
         for k, ((w, r), e) in enumerate(zip(way, errors, strict=True))
     ]
     numbers = [x.cpu().numpy() for x in (widths, radii, grid, way, errors)]
-    picture = LearnedKernel(problem.name, *numbers)
     shown = Table.of(taken[:: -(-len(taken) // _SHOWN)])
-    table, drawing = Table.of(taken), partial(draw_learned_kernel, picture)
+    table, drawing = Table.of(taken), partial(draw_learned_kernel, problem.name, *numbers)
     report(cfg, out, _log, "learn_kernel", table, drawing, shown=shown, heading="Along the way:")
     return out.metrics(summary(path, errors, widths, radii, grid))
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..centers import probe_points
 from ..engine import ChaseResult
-from ..figures.chase import MemoryPicture, draw_memory
+from ..figures.chase import draw_memory
 from ..numerics.checks import COMMAND_LINE, fail, integer, positive_real
 from ..online.experience_memory import ExperienceMemory
 from ..results.run_directory import RunDirectory
@@ -55,7 +55,8 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
     excess = revisits(problem, settings, memory, found, first)
     metrics = summary(memory, over, excess, settled)
     stored = memory.states[0][memory.stored[0]]
-    picture = MemoryPicture(  # of the first trajectory
+    drawing = partial(  # of the first trajectory
+        draw_memory,
         path=states[0, first:].cpu().numpy(),
         stored=stored.cpu().numpy(),
         radius=memory.basis.centers.radius(stored).expand(len(stored)).cpu().numpy(),
@@ -64,7 +65,7 @@ def run(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
         excess={STARTS[k]: v[0].amax(0).cpu().numpy() for k, v in excess.items()},
         settled=float(settled[0]),
     )
-    drawing, shown, out = partial(draw_memory, picture), _shown(metrics), RunDirectory(directory)
+    shown, out = _shown(metrics), RunDirectory(directory)
     report(cfg, out, _log, "memory", Table.of([metrics]), drawing, shown=shown)
     return out.metrics(metrics)
 

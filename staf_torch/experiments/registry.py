@@ -241,14 +241,9 @@ def in_calls(
     """Return the results of jobs, of which those whose objects differ in numbers alone share a call.
 
     Where objects differ in more there are several calls, and where one refuses numbers of a row's own, as not
-    all objects serve them, its jobs run one after the other: those of the same objects together.
-
-    Args:
-        call: gets the jobs by number, the objects that have the numbers of all, their rows, and `advance`.
-        objects: of each job; the same object for jobs that share it.
-        counts: rows of each job.
-        alike: what jobs must have in common to share a call.
-        advance: is told how much more is done; None where nobody listens.
+    all objects serve them, its jobs run one after the other: those of the same objects together. A ``call``
+    gets the jobs by number, the objects that have the numbers of all, their rows, and ``advance``; jobs share
+    it whose ``alike`` are equal, and ``counts`` are their rows.
     """
     found: dict[int, _R] = {}
     groups = grouped(range(len(objects)), lambda i: alike[i]).values()

@@ -55,18 +55,6 @@ class ConvergenceCurve(NamedTuple):
     slope: float | None
 
 
-class MemoryPicture(NamedTuple):
-    """A trajectory and its memory."""
-
-    path: np.ndarray  # (T, n), settled
-    stored: np.ndarray  # (N, n) states of the models
-    radius: np.ndarray  # (N,) of their centers
-    time: np.ndarray  # (K,) seconds
-    errors: dict[str, np.ndarray]  # approximant -> max |V - V^| on the ball, (K,)
-    excess: dict[str, np.ndarray]  # start -> largest excess over the revisits, (S,)
-    settled: float  # the largest excess of the settled chase
-
-
 def draw_chase(history: ChaseHistory) -> Figure:
     """The four panels of the paper's simulation: state, V against V^, weights, error and excess.
 
@@ -122,14 +110,22 @@ def draw_convergence(found: Sequence[ConvergenceCurve]) -> Figure:
     return figure
 
 
-def draw_memory(picture: MemoryPicture) -> Figure:
+def draw_memory(
+    path: np.ndarray,  # (T, n), settled
+    stored: np.ndarray,  # (N, n) states of the models
+    radius: np.ndarray,  # (N,) of their centers
+    time: np.ndarray,  # (K,) seconds
+    errors: dict[str, np.ndarray],  # approximant -> max |V - V^| on the ball, (K,)
+    excess: dict[str, np.ndarray],  # start -> largest excess over the revisits, (S,)
+    settled: float,  # the largest excess of the settled chase
+) -> Figure:
     """Draw the states of stored models, the error over the visited region, the excess after a revisit."""
     from matplotlib.collections import EllipseCollection
 
     with panels(3, 3, high=2.3) as (figure, (plane, region, revisits)):
-        second = 1 if picture.path.shape[1] > 1 else 0  # a single state against itself
-        plane.plot(picture.path[:, 0], picture.path[:, second], color="0.6", label="path")
-        points, diameter = picture.stored[:, [0, second]], 2 * picture.radius
+        second = 1 if path.shape[1] > 1 else 0  # a single state against itself
+        plane.plot(path[:, 0], path[:, second], color="0.6", label="path")
+        points, diameter = stored[:, [0, second]], 2 * radius
         look: dict[str, Any] = {"facecolor": "none", "edgecolor": colour(0), "linewidth": 0.3, "alpha": 0.5}
         where: dict[str, Any] = {"units": "xy", "offsets": points, "transOffset": plane.transData}
         sizes = diameter, diameter, np.zeros_like(diameter)
@@ -138,12 +134,12 @@ def draw_memory(picture: MemoryPicture) -> Figure:
         plane.margins(0.12)
         plane.set(xlabel="$x_1$", ylabel=f"$x_{second + 1}$")
         plane.set_aspect("equal", adjustable="datalim")
-        named(region, picture.time, picture.errors, log=True)
+        named(region, time, errors, log=True)
         region.set(xlabel="time of the visit (s)", ylabel=r"$\max\,|V - \hat V|$ on the ball")
         region.margins(x=0)
-        steps = len(next(iter(picture.excess.values())))
-        named(revisits, np.arange(1, steps + 1), picture.excess, log=True)
-        revisits.axhline(picture.settled, color="0.2", linestyle=":", linewidth=0.8, label="settled chase")
+        steps = len(next(iter(excess.values())))
+        named(revisits, np.arange(1, steps + 1), excess, log=True)
+        revisits.axhline(settled, color="0.2", linestyle=":", linewidth=0.8, label="settled chase")
         revisits.set(xscale="log", xlabel="steps after the revisit", ylabel="largest excess")
         for axes in (plane, region, revisits):
             legend(axes)
@@ -151,48 +147,43 @@ def draw_memory(picture: MemoryPicture) -> Figure:
     return figure
 
 
-class LearnedKernel(NamedTuple):
-    """The way of a kernel's width and its centers' radius over a grid of both."""
-
-    name: str  # of the width, in words
-    widths: np.ndarray  # (W,)
-    radii: np.ndarray  # (R,)
-    grid: np.ndarray  # errors (R, W)
-    path: np.ndarray  # width and radius after each step, (S + 1, 2)
-    errors: np.ndarray  # (S + 1,)
-
-
-def draw_learned_kernel(picture: LearnedKernel) -> Figure:
-    """Draw the path over the errors of the grid, and the error over the steps."""
+def draw_learned_kernel(
+    name: str,  # of the width, in words
+    widths: np.ndarray,  # (W,)
+    radii: np.ndarray,  # (R,)
+    grid: np.ndarray,  # errors (R, W)
+    path: np.ndarray,  # width and radius after each step, (S + 1, 2)
+    errors: np.ndarray,  # (S + 1,)
+) -> Figure:
+    """Draw the path over the errors of the grid of widths and radii, and the error over the steps."""
     from matplotlib.colors import LogNorm
 
-    grid, radii, widths = picture.grid, picture.radii, picture.widths
     best = int(np.nan_to_num(grid, nan=np.inf).argmin())
-    least = int(np.nan_to_num(picture.errors, nan=np.inf).argmin())
+    least = int(np.nan_to_num(errors, nan=np.inf).argmin())
     known = grid[np.isfinite(grid) & (grid > 0)]
     norm = LogNorm(known.min(), known.max()) if known.size and known.max() > known.min() else None
     with panels(2, 2, high=2.6) as (figure, (plane, steps)):
         plane.set_facecolor("0.92")
         image = plane.pcolormesh(widths, radii, grid, norm=norm, cmap="viridis", shading="nearest")
-        plane.set(xscale="log", yscale="log", xlabel=picture.name, ylabel="radius $r$ of the centers")
+        plane.set(xscale="log", yscale="log", xlabel=name, ylabel="radius $r$ of the centers")
         plane.grid(False)
-        plane.plot(*picture.path.T, ".-", color="white", markersize=2, linewidth=0.8)
+        plane.plot(*path.T, ".-", color="white", markersize=2, linewidth=0.8)
         row, column = np.unravel_index(best, grid.shape)
         drawn = {
-            "start": (picture.path[0], "o", 5),
+            "start": (path[0], "o", 5),
             "best of the grid": ((widths[column], radii[row]), "s", 5),
-            "least of the way": (picture.path[least], "*", 9),
+            "least of the way": (path[least], "*", 9),
         }
         look: dict[str, Any] = {"color": "white", "markeredgecolor": "black", "linestyle": "none"}
         marks = [
             plane.plot(*at, kind, markersize=size, label=label, **look)[0]
             for label, (at, kind, size) in drawn.items()
         ]
-        for name, values in (("x", widths), ("y", radii)):
-            ticks(plane, name, [t for t in _ROUND if values[0] <= t <= values[-1]])
+        for axis, values in (("x", widths), ("y", radii)):
+            ticks(plane, axis, [t for t in _ROUND if values[0] <= t <= values[-1]])
         plane.minorticks_off()
         figure.colorbar(image, ax=plane, label="error on the ball")
-        (line,) = steps.semilogy(picture.errors, color=colour(0), label="gradient")
+        (line,) = steps.semilogy(errors, color=colour(0), label="gradient")
         floor = steps.axhline(grid.flat[best], color="0.2", linestyle=":", linewidth=0.8)
         floor.set_label("least of the grid")
         steps.set(xlabel="step of Adam", ylabel="root mean square error on the ball")

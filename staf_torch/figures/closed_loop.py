@@ -53,17 +53,6 @@ class AdpHistory(NamedTuple):
     high: np.ndarray = np.empty(0)
 
 
-class TrackingHistory(NamedTuple):
-    """A trajectory, followed with an identified drift, and the errors of the other variants."""
-
-    time: np.ndarray  # (T,) seconds
-    state: np.ndarray  # (T, 4) of the identified run: e and xd
-    errors: dict[str, np.ndarray]  # variant -> |e|, (T,); NaN once it diverged
-    parameters: np.ndarray  # (T, 6) theta^ row by row
-    truth: np.ndarray  # (6,) theta
-    critic_weights: np.ndarray  # (T, M)
-
-
 def draw_adp(history: AdpHistory) -> Figure:
     """State, actor weights, critic weights, |u - u*|, |V - V^| and the running cost; a panel a unit.
 
@@ -159,24 +148,31 @@ def draw_initial_weights(weights: Sequence[float], found: Mapping[str, Sequence[
     return figure
 
 
-def draw_tracking(history: TrackingHistory) -> Figure:
+def draw_tracking(
+    time: np.ndarray,  # (T,) seconds
+    state: np.ndarray,  # (T, 4) of the run with an identified drift: e and xd
+    errors: Mapping[str, np.ndarray],  # variant -> |e|, (T,); NaN once it diverged
+    parameters: np.ndarray,  # (T, 6) theta^ row by row
+    truth: np.ndarray,  # (6,) theta
+    critic_weights: np.ndarray,  # (T, M)
+) -> Figure:
     """State against desired state, |e| of every variant, theta^ against theta, critic weights."""
     with panels(4) as (figure, grid):
         for i in range(2):
-            desired = history.state[:, 2 + i]
+            desired = state[:, 2 + i]
             look = {"linestyle": dash(i), "color": colour(i), "label": f"$x_{i + 1}$"}
-            grid[0].plot(history.time, history.state[:, i] + desired, **look)
-            grid[0].plot(history.time, desired, ":", color="0.2", label="desired" if i else None)
+            grid[0].plot(time, state[:, i] + desired, **look)
+            grid[0].plot(time, desired, ":", color="0.2", label="desired" if i else None)
         grid[0].set_ylabel("state")
-        named(grid[1], history.time, history.errors, log=True)
+        named(grid[1], time, errors, log=True)
         grid[1].set_ylabel("$|x - x_d|$")
-        estimates(grid[2], history.time, history.parameters, history.truth)
+        estimates(grid[2], time, parameters, truth)
         grid[2].set_ylabel(r"drift parameters $\hat\theta$")
-        _critic(grid[3], history.time, history.critic_weights)
+        _critic(grid[3], time, critic_weights)
         for axes in grid:
             legend(axes)
         letter(grid)
-        against_time(grid, history.time)
+        against_time(grid, time)
     return figure
 
 
@@ -216,31 +212,27 @@ def draw_faults(cases: Mapping[str, FaultPicture]) -> Figure:
     return figure
 
 
-class GainSets(NamedTuple):
-    """Concurrent learning with many gains, from two sources of equations."""
-
-    time: np.ndarray  # (T,) seconds
-    parameters: np.ndarray  # (T, p) theta^ of one gain set
-    truth: np.ndarray  # (p,)
-    error: dict[str, np.ndarray]  # source -> RMS of e, (B,)
-    parameter_error: dict[str, np.ndarray]  # source -> RMS of theta^ - theta, (B,)
-    followed: dict[str, np.ndarray]  # source -> |e| of that gain set, (T,)
-
-
-def draw_gain_sets(sets: GainSets) -> Figure:
+def draw_gain_sets(
+    time: np.ndarray,  # (T,) seconds
+    parameters: np.ndarray,  # (T, p) theta^ of one gain set
+    truth: np.ndarray,  # (p,)
+    error: Mapping[str, np.ndarray],  # source of equations -> RMS of e, (B,)
+    parameter_error: Mapping[str, np.ndarray],  # source -> RMS of theta^ - theta, (B,)
+    followed: Mapping[str, np.ndarray],  # source -> |e| of that gain set, (T,)
+) -> Figure:
     """theta^ and |e| of one gain set, and the RMS of both errors over all gain sets, sorted."""
     with panels(4) as (figure, grid):
         letter(grid)
-        estimates(grid[0], sets.time, sets.parameters, sets.truth)
+        estimates(grid[0], time, parameters, truth)
         grid[0].set_ylabel(r"parameters $\hat\theta$")
-        for i, (name, values) in enumerate(sets.followed.items()):
+        for i, (name, values) in enumerate(followed.items()):
             look = {"linestyle": dash(i), "color": colour(i), "label": name, "linewidth": 0.7}
-            grid[1].semilogy(sets.time, positive(values), **look)
+            grid[1].semilogy(time, positive(values), **look)
         decades(grid[1])
         grid[1].set_ylabel("$|x - x_d|$")
-        against_time(grid[:2], sets.time)
-        shares(grid[2], sets.error)
-        shares(grid[3], sets.parameter_error)
+        against_time(grid[:2], time)
+        shares(grid[2], error)
+        shares(grid[3], parameter_error)
         labels = "RMS of $x - x_d$", r"RMS of $\hat\theta - \theta$"
         for axes, label in zip(grid[2:], labels, strict=True):
             axes.set(xscale="log", xlabel=label, ylabel="share of gain sets")
