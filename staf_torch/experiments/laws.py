@@ -8,7 +8,7 @@ import logging
 import math
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from omegaconf import DictConfig
@@ -173,7 +173,7 @@ def table(
 
 
 def _metrics(problem: ChaseProblem, case: LawCase, errors: StateErrorPass) -> Metrics:
-    law = {"law": case.law, "inner_steps": case.iterations, "predictor": case.predictor}
+    law: dict[str, Any] = {"law": case.law, "inner_steps": case.iterations, "predictor": case.predictor}
     (outcome,) = chase_batch.simulate([dataclasses.replace(problem, **law)], [None], [False], errors=errors)
     return outcome.metrics
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -85,7 +86,9 @@ def settings_of(cfg: DictConfig) -> dict[str, Any]:
     Raises:
         ValueError: if a setting breaks its rule; the message names it.
     """
-    checks = dict.fromkeys(("capacity", "states", "revisits", "steps"), partial(integer, least=1))
+    checks: dict[str, Callable[..., float]] = dict.fromkeys(
+        ("capacity", "states", "revisits", "steps"), partial(integer, least=1)
+    )
     checks |= dict.fromkeys(("reach", "spacing"), positive_real)
     return {name: check(COMMAND_LINE, f"memory.{name}", cfg.memory[name]) for name, check in checks.items()}
 

@@ -128,8 +128,8 @@ def draw_memory(
         points, diameter = stored[:, [0, second]], 2 * radius
         look: dict[str, Any] = {"facecolor": "none", "edgecolor": colour(0), "linewidth": 0.3, "alpha": 0.5}
         where: dict[str, Any] = {"units": "xy", "offsets": points, "transOffset": plane.transData}
-        sizes = diameter, diameter, np.zeros_like(diameter)
-        plane.add_collection(EllipseCollection(*sizes, **where, **look))
+        balls = EllipseCollection(diameter, diameter, np.zeros_like(diameter), **where, **look)
+        plane.add_collection(balls)
         plane.plot(points[:, 0], points[:, 1], ".", color=colour(0), markersize=3, label="stored model")
         plane.margins(0.12)
         plane.set(xlabel="$x_1$", ylabel=f"$x_{second + 1}$")

@@ -195,7 +195,7 @@ def _split(
     runs: Sequence[RecordedRun], key: Callable[[RecordedRun], object]
 ) -> list[tuple[Any, list[RecordedRun]]]:
     """By a key: numbers in order, then the others as they came."""
-    return sorted(grouped(runs, key).items(), key=lambda item: rank(item[0]))  # type: ignore[arg-type]
+    return sorted(grouped(runs, key).items(), key=lambda item: rank(item[0]))
 
 
 def _points(runs: Sequence[RecordedRun], key: str, metric: str) -> tuple[Point, ...]:
