@@ -7,7 +7,7 @@ from helpers import uniform
 from torch import Tensor
 
 from staf_torch import adp
-from staf_torch.adp.adaptation.windows import Equation
+from staf_torch.adp.adaptation.identification import Equation
 
 TRUE = torch.tensor([0.1, 1.0], dtype=torch.float64)
 

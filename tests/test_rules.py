@@ -27,7 +27,7 @@ from staf_torch.adp.policies.sampled_rollout import SampledRollout
 from staf_torch.adp.problem.held_linear import exact_hold
 from staf_torch.approximation.conditioning import lebesgue_constant, sup_error
 from staf_torch.deploy.approximators import RidgeApproximator
-from staf_torch.envs.episodes import Episodes
+from staf_torch.envs.plant_env import Episodes
 from staf_torch.numerics.registry import variants, without_arguments
 from staf_torch.numerics.riccati import riccati_rows
 from staf_torch.systems import trajectory

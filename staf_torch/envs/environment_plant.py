@@ -1,7 +1,8 @@
-"""A Gymnasium environment as a plant: put into a state, stepped, and read."""
+"""Environments of others: one as a plant, put into a state, stepped and read, and agents that play in one."""
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -12,12 +13,16 @@ import torch
 from gymnasium import spaces
 from torch import Tensor
 
-from ..numerics.checks import choice, fail
+from ..adp import Controller, Feedback
+from ..adp.loop.controller import Carried, Policy
+from ..adp.loop.step import points_of_steps
+from ..lanes.row_numbers import over_rows
+from ..numerics.checks import choice, fail, positive_real
 from ..numerics.runge_kutta import runge_kutta_step
 from ..systems import StepPlant
 from ..systems.base import Limit
 from ..systems.user_plants import Guess
-from .episodes import Numbers
+from .plant_env import Numbers
 
 Read = Callable[[Any], Numbers]
 """x (n,) of an environment without its wrappers."""
@@ -227,3 +232,67 @@ def _mountain_car() -> StepPlant:
         return torch.stack((after, torch.where(at_wall, 0.0, faster)), dim=-1)
 
     return StepPlant(step, dim=2, inputs=1, dt=1.0, equilibrium=[0.45, 0.0], low=-1.0, high=1.0)
+
+
+class Agent:
+    """Observations of NumPy in, actions of NumPy out, from a feedback law or a learning controller.
+
+    A learning controller learns on from step to step, row by row; `begin` makes it forget.
+
+    Example:
+        >>> import gymnasium
+        >>> env = gymnasium.make("staf_torch/TwoState-v0")
+        >>> agent = envs.Agent(adp.LQR(env.unwrapped.plant, env.unwrapped.cost))
+        >>> observation, _ = env.reset(seed=0)
+        >>> agent(observation).shape
+        (1,)
+
+        Shown by `staf_torch/envs/README.md`.
+
+    Args:
+        controller: a `Controller`, or a policy (..., n) -> (..., m).
+        dt: s, between two actions.
+        seed: of the random numbers that the controller draws; row b draws from seed + b, as in
+            `adp.simulate`.
+        state: the plant's state from an observation, (..., k) -> (..., n) of NumPy arrays, where an
+            environment shows another thing: the sine and cosine of an angle, say.
+        action: the action from a control, (..., m) of NumPy, where an environment wants another thing: the
+            number of one of its actions, say.
+    """
+
+    def __init__(
+        self,
+        controller: Controller | Policy,
+        *,
+        dt: float = 0.01,
+        seed: int = 0,
+        state: Callable[[Numbers], Numbers] | None = None,
+        action: Callable[[Numbers], Any] | None = None,
+    ) -> None:
+        self.controller = controller if isinstance(controller, Controller) else Feedback(controller)
+        self.dt, self.seed = positive_real("Agent", "dt", dt), seed
+        self.state, self.action = state, action
+        self._carried: Carried | None = None
+        self._steps = 0  # since `begin`
+
+    def begin(self) -> None:
+        """Forget what was learned, and begin the sequence of random numbers anew."""
+        self._carried = None
+
+    def __call__(self, observation: Numbers | Tensor) -> Any:
+        """u, or the action that stands for it: (n,) -> (m,), or (B, n) -> (B, m) with the same B until the
+        next `begin`."""
+        shown = observation if self.state is None else self.state(np.asarray(observation))
+        seen = torch.as_tensor(shown, device=getattr(shown, "device", "cpu")).to("cpu", torch.float64)
+        x = seen.reshape(-1, seen.shape[-1])
+        with torch.no_grad():
+            if self._carried is None:
+                self._carried = over_rows(self.controller.init, x)
+                self._steps = 0
+            seeds = range(self.seed, self.seed + len(x))
+            uniform = points_of_steps(x, seeds, self._steps, 1, self.controller.draws)[:, 0]
+            self._steps += 1
+            step = functools.partial(self.controller.step, dt=self.dt)
+            u, self._carried = over_rows(step, x, self._carried, uniform)
+        control: Numbers = u.reshape(*seen.shape[:-1], -1).numpy()
+        return control if self.action is None else self.action(control)

@@ -15,8 +15,7 @@ from ..approximation.basis import REACH, StaFBasis, Target
 from ..engine import ChaseResult, chase_pieces, chunk_length
 from ..engine.predictors import Predictor
 from ..lanes.row_numbers import over_rows
-from ..metrics.ball_error import StateErrorPass
-from ..metrics.chase import ChaseMetrics, Member
+from ..metrics.chase import ChaseMetrics, Member, StateErrorPass
 from ..optim import UpdateLaw
 from ..settings.chase import ChaseProblem, warnings_to
 from ..systems import ControlAffineSystem, trajectory

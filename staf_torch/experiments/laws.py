@@ -17,7 +17,7 @@ from torch import Tensor
 from .. import optim, theory
 from ..engine.predictors import Predictor, Secant, Tangent
 from ..figures.chase import ConvergenceCurve, draw_convergence
-from ..metrics.ball_error import StateErrorPass
+from ..metrics.chase import StateErrorPass
 from ..numerics.checks import COMMAND_LINE, fail, integer, positive_real, vector
 from ..optim import UpdateLaw
 from ..results.run_directory import RunDirectory

@@ -23,7 +23,7 @@ from staf_torch import (
     systems,
     targets,
 )
-from staf_torch.metrics.ball_error import StateErrorPass
+from staf_torch.metrics.chase import StateErrorPass
 
 
 @functools.cache

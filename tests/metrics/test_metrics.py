@@ -11,7 +11,7 @@ from variants import KERNELS, over
 
 import staf_torch as st
 from staf_torch.approximation.conditioning import sup_error
-from staf_torch.metrics.ball_error import StateErrorPass
+from staf_torch.metrics.chase import StateErrorPass
 from staf_torch.numerics.linalg import condition_number
 from staf_torch.targets import Paper
 

@@ -17,8 +17,7 @@ from staf_torch import optim
 from staf_torch.adp import LoopResult
 from staf_torch.engine import Certificate, ChaseResult
 from staf_torch.metrics import Metric
-from staf_torch.metrics.ball_error import StateErrorPass
-from staf_torch.metrics.chase import ChaseMetrics, Member
+from staf_torch.metrics.chase import ChaseMetrics, Member, StateErrorPass
 from staf_torch.metrics.closed_loop import adp_metrics, comparison_row, regulated, tracking_metrics
 from staf_torch.targets import Paper
 

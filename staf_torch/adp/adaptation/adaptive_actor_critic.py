@@ -16,10 +16,9 @@ from ..critic.actor_critic import ActorCritic
 from ..critic.laws import BellmanTerms, Weights
 from ..loop.controller import Controller, Policy
 from ..problem.cost import matvec
-from .history_stack import ConcurrentLearning, Identified
-from .least_squares import Estimate, LeastSquares
+from .concurrent_learning import ConcurrentLearning, Identified
+from .identification import Estimate, IntegralWindows, LeastSquares, Window
 from .parametric import ParametricPlant
-from .windows import IntegralWindows, Window
 
 
 class LearnedModel(NamedTuple):

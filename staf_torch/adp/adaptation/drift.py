@@ -23,8 +23,8 @@ from ..loop.controller import LQR, Controller, Policy
 from ..problem.cost import Cost, matvec, quadratic
 from ..problem.rules import regulated
 from .adaptive_lqr import Redesign
+from .identification import Equation, IntegralWindows, Window
 from .parametric import ParametricPlant
-from .windows import Equation, IntegralWindows, Window
 
 _NODES = (0.06943184420297371, 0.33000947820757187, 0.6699905217924281, 0.9305681557970262)
 _WEIGHTS = (0.17392742256872692, 0.32607257743127307, 0.32607257743127307, 0.17392742256872692)

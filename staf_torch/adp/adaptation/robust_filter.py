@@ -16,9 +16,8 @@ from ..loop.controller import Carried, Controller
 from ..safety.conditions import Constraint, listed
 from ..safety.quadratic_program import nearest_admissible
 from ..safety.safety_filter import INFEASIBLE, SafetyFilter
-from .least_squares import Estimate, LeastSquares
+from .identification import Estimate, IntegralWindows, LeastSquares, Window
 from .parametric import ChangingPlant, ParametricPlant
-from .windows import IntegralWindows, Window
 
 _FAR = 1e300  # h before anything was seen: finite, as what is carried must be
 _PASSES = 2  # linearisations of the conditions in u

@@ -13,8 +13,7 @@ from torch import Tensor
 
 from staf_torch import GaussianKernel, adp, rings, systems
 from staf_torch.adp.adaptation.adaptive_lqr import Redesign
-from staf_torch.adp.adaptation.least_squares import Estimate
-from staf_torch.adp.adaptation.windows import Equation
+from staf_torch.adp.adaptation.identification import Equation, Estimate
 from staf_torch.adp.estimation import Belief, KalmanFilter
 from staf_torch.numerics.riccati import control_rate, riccati_residual, riccati_rows
 

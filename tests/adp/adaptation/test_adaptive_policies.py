@@ -11,7 +11,7 @@ from helpers_adaptation import COST, DAMPING, friction_and_inertia, gravity
 from torch import Tensor
 
 from staf_torch import GaussianKernel, adp, rings, systems
-from staf_torch.adp.adaptation.least_squares import Estimate
+from staf_torch.adp.adaptation.identification import Estimate
 from staf_torch.systems.two_state_tracking import regressor
 
 KNOWN = systems.Linear([[0.0, 1.0], [-0.4, 0.2]], [[0.0], [1.0]])

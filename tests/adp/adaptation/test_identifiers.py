@@ -11,7 +11,7 @@ from helpers_adaptation import PENDULUM, TRUE, equations
 from torch import Tensor
 
 from staf_torch import adp, systems
-from staf_torch.adp.adaptation.history_stack import ConcurrentGradient
+from staf_torch.adp.adaptation.concurrent_learning import ConcurrentGradient
 
 MODEL = PENDULUM.believing(tensor([7.0, 7.0]))  # theta of the model is not used
 

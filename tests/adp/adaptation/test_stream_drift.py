@@ -9,7 +9,7 @@ from torch import Tensor
 
 from staf_torch import GaussianKernel, adp, rings, systems
 from staf_torch.adp.adaptation.drift import DriftEstimate
-from staf_torch.adp.adaptation.windows import Equation
+from staf_torch.adp.adaptation.identification import Equation
 
 KNOWN = systems.Linear([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
 COST = adp.QuadraticCost(1.0, 1.0, dim=2, inputs=1)

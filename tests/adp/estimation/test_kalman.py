@@ -9,7 +9,7 @@ from helpers_adaptation import PENDULUM
 from torch import Tensor
 
 from staf_torch import adp, systems
-from staf_torch.adp.adaptation.least_squares import Estimate
+from staf_torch.adp.adaptation.identification import Estimate
 from staf_torch.adp.estimation import Belief, KalmanFilter
 from staf_torch.adp.loop.step import ClosedLoop, program
 

@@ -13,7 +13,7 @@ from helpers_adp import Yaw
 from torch import Tensor
 
 from staf_torch import GaussianKernel, adp, rings, systems
-from staf_torch.adp.adaptation.windows import Equation
+from staf_torch.adp.adaptation.identification import Equation
 from staf_torch.adp.estimation import Belief, KalmanFilter
 from staf_torch.adp.loop.controller import Carried
 
