@@ -1,4 +1,4 @@
-"""Episodes of a plant, and it as a Gymnasium environment, alone or in rows as one tensor program, by names."""
+"""Episodes of a plant, and Gymnasium environments of them: one alone, or rows as one tensor program."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from ..lanes.gradients import refuse_gradient
 from ..lanes.per_row.objects import counts_of_rows
 from ..lanes.row_numbers import all_rows, over_rows
 from ..numerics.checks import choice, fail, integer, one_or_each, positive, positive_real
-from ..systems import Bounds, ControlAffineSystem, Plant
+from ..systems import Bounds, ControlAffineSystem
 
 NamedPlant = str | type[ControlAffineSystem] | ControlAffineSystem
 _ACTION = 20.0  # the largest action where neither plant nor cost states bounds
@@ -53,30 +53,6 @@ def make_plant(plant: NamedPlant) -> ControlAffineSystem:
     return made
 
 
-def make_cost(plant: ControlAffineSystem, cost: Cost | None) -> Cost:
-    """The cost given, or x'x + u'u."""
-    assert plant.dim is not None
-    return QuadraticCost(1.0, 1.0, plant.dim, plant.inputs) if cost is None else cost
-
-
-def make_bounds(plant: Plant, cost: Cost, bound: float | None) -> Bounds:
-    """The bounds of the actions: the one given, else those of the cost or the plant, else 20."""
-    if bound is not None:
-        positive_real("PlantEnv", "bound", bound)
-        return Bounds(-bound, bound, plant.inputs)
-    known = cost.around(plant).bounds
-    return Bounds(-_ACTION, _ACTION, plant.inputs) if known is None else known
-
-
-def make_spaces(plant: Plant, limit: float, bounds: Bounds) -> tuple[spaces.Box, spaces.Box]:
-    """Observations: the state, each coordinate within the limit. Actions: the inputs within their bounds, of
-    numbers of rows the widest."""
-    assert plant.dim is not None
-    seen = spaces.Box(-limit, limit, (plant.dim,), np.float64)
-    low, high = (all_rows(limit).reshape(-1, plant.inputs) for limit in (bounds.low, bounds.high))
-    return seen, spaces.Box(low.amin(0).numpy(), high.amax(0).numpy(), (plant.inputs,), np.float64)
-
-
 def to_control(action: Numbers | Tensor, shape: tuple[int, ...], bounds: Bounds) -> Tensor:
     """An action of NumPy or torch as float64, in the action space.
 
@@ -97,22 +73,7 @@ def to_control(action: Numbers | Tensor, shape: tuple[int, ...], bounds: Bounds)
     return u
 
 
-def make_spread(call: str, plant: Plant, spread: float | Sequence[float] | Tensor | None) -> float | Numbers:
-    """Return half the width of the box of initial states: a number, or one a coordinate, (n,).
-
-    Raises:
-        ValueError: in the name of ``call``, if it is not positive, or not one a coordinate.
-    """
-    given = plant.spread if spread is None else spread
-    if isinstance(given, int | float):
-        return positive_real(call, "spread", given)
-    each = positive(call, "spread", one_or_each(call, "spread", given, plant.equilibrium().shape[0]))
-    return each.numpy()
-
-
-def start(
-    options: dict[str, Any] | None, generators: list[np.random.Generator], spread: float | Numbers, dim: int
-) -> Tensor:
+def start(options: dict[str, Any] | None, generators: list[np.random.Generator], spread: Numbers) -> Tensor:
     """The initial states, (B, n): those of options["state"], or uniform in [-spread, spread]^n, a generator
     a row.
 
@@ -121,12 +82,14 @@ def start(
     """
     stated = None if options is None else options.get("state")
     if stated is None:
-        return torch.stack([torch.from_numpy(g.uniform(-spread, spread, dim)) for g in generators])
+        return torch.stack([torch.from_numpy(g.uniform(-spread, spread)) for g in generators])
     states = torch.as_tensor(stated, device=getattr(stated, "device", "cpu")).to("cpu", torch.float64)
     if states.dim() == 1:
         states = states.expand(len(generators), -1)
-    if states.shape != (len(generators), dim) or not bool(torch.isfinite(states).all()):
-        raise fail("reset", 'options["state"]', f"must be ({len(generators)}, {dim}) and finite", states)
+    if states.shape != (len(generators), len(spread)) or not bool(torch.isfinite(states).all()):
+        raise fail(
+            "reset", 'options["state"]', f"must be ({len(generators)}, {len(spread)}) and finite", states
+        )
     return states.clone()
 
 
@@ -222,7 +185,37 @@ class Episodes:
 Flags = np.ndarray[Any, np.dtype[np.bool_]]
 
 
-class PlantEnv(gymnasium.Env):
+class _Regulated:
+    """What both environments have: a plant, its cost, the bounds of the actions and the episodes."""
+
+    def _prepare(
+        self,
+        rows: int,
+        plant: NamedPlant,
+        cost: Cost | None,
+        spread: float | Sequence[float] | None,
+        bound: float | None,
+        limit: float,
+        **more: float,
+    ) -> tuple[spaces.Box, spaces.Box]:
+        """Check the arguments, and return the spaces of observations and actions."""
+        call = type(self).__name__
+        self.plant = make_plant(plant)
+        dim, inputs = self.plant._size(), self.plant.inputs
+        self.cost = QuadraticCost(1.0, 1.0, dim, inputs) if cost is None else cost
+        if bound is not None:
+            self.bounds = Bounds(-positive_real(call, "bound", bound), bound, inputs)
+        else:
+            self.bounds = self.cost.around(self.plant).bounds or Bounds(-_ACTION, _ACTION, inputs)
+        self.episodes = Episodes(self.plant, self.cost, rows, limit=limit, **more)
+        wide = one_or_each(call, "spread", self.plant.spread if spread is None else spread, dim)
+        self.spread = positive(call, "spread", wide).numpy()
+        low, high = (all_rows(end).reshape(-1, inputs) for end in (self.bounds.low, self.bounds.high))
+        actions = spaces.Box(low.amin(0).numpy(), high.amax(0).numpy(), (inputs,), np.float64)
+        return spaces.Box(-limit, limit, (dim,), np.float64), actions
+
+
+class PlantEnv(_Regulated, gymnasium.Env):
     """Regulate a plant to the origin: the observation is x, the action u is held for dt, the reward is
     -int (x'Qx + u'Ru) dt over that time.
 
@@ -265,21 +258,16 @@ class PlantEnv(gymnasium.Env):
         limit: float = 100.0,
         penalty: float = 1e4,
     ) -> None:
-        self.plant = make_plant(plant)
-        self.cost = make_cost(self.plant, cost)
-        self.bounds = make_bounds(self.plant, self.cost, bound)
-        self.episodes = Episodes(
-            self.plant, self.cost, 1, dt=dt, horizon=horizon, limit=limit, penalty=penalty
+        self.observation_space, self.action_space = self._prepare(
+            1, plant, cost, spread, bound, limit, dt=dt, horizon=horizon, penalty=penalty
         )
-        self.observation_space, self.action_space = make_spaces(self.plant, limit, self.bounds)
-        self.spread = make_spread("PlantEnv", self.plant, spread)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Numbers, dict[str, Any]]:
         """A new episode: its first observation."""
         super().reset(seed=seed)
-        x0 = start(options, [self.np_random], self.spread, self.episodes.state.shape[1])
+        x0 = start(options, [self.np_random], self.spread)
         self.episodes.begin(torch.ones(1, dtype=torch.bool, device="cpu"), x0)
         return self._observation(), {}
 
@@ -297,7 +285,7 @@ class PlantEnv(gymnasium.Env):
         return self.episodes.state[0].numpy().copy()
 
 
-class PlantVectorEnv(VectorEnv):
+class PlantVectorEnv(_Regulated, VectorEnv):
     """`PlantEnv` in B rows that never touch each other: row b is the single environment seeded seed + b.
 
     Example:
@@ -339,16 +327,11 @@ class PlantVectorEnv(VectorEnv):
         self.num_envs = integer("PlantVectorEnv", "num_envs", num_envs, least=1)
         self.mode = AutoresetMode(autoreset_mode)
         self.metadata = {**type(self).metadata, "autoreset_mode": self.mode}
-        self.plant = make_plant(plant)
-        self.cost = make_cost(self.plant, cost)
-        self.bounds = make_bounds(self.plant, self.cost, bound)
-        self.episodes = Episodes(
-            self.plant, self.cost, num_envs, dt=dt, horizon=horizon, limit=limit, penalty=penalty
+        self.single_observation_space, self.single_action_space = self._prepare(
+            self.num_envs, plant, cost, spread, bound, limit, dt=dt, horizon=horizon, penalty=penalty
         )
-        self.single_observation_space, self.single_action_space = make_spaces(self.plant, limit, self.bounds)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.spread = make_spread("PlantVectorEnv", self.plant, spread)
         self._generators: list[np.random.Generator] = []
         self._over = torch.zeros(num_envs, dtype=torch.bool, device="cpu")
 
@@ -395,13 +378,12 @@ class PlantVectorEnv(VectorEnv):
 
     def _begin(self, rows: Tensor, options: dict[str, Any] | None) -> None:
         # A row draws from its own generator, and only when it begins: no row depends on another.
-        dim = self.episodes.state.shape[1]
         chosen = rows.nonzero().flatten().tolist()
         x0 = self.episodes.state.clone()
         if options is not None and options.get("state") is not None:
-            x0 = start(options, self._generators, self.spread, dim)
+            x0 = start(options, self._generators, self.spread)
         elif chosen:
-            x0[rows] = start(None, [self._generators[row] for row in chosen], self.spread, dim)
+            x0[rows] = start(None, [self._generators[row] for row in chosen], self.spread)
         self.episodes.begin(rows, x0)
         self._over = self._over & ~rows
 

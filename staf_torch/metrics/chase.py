@@ -265,21 +265,17 @@ class ChaseMetrics:
         own: Sequence[Metric] = (),
         errors: StateErrorPass | None = None,
     ) -> None:
-        self._basis, self._target, self._law = basis, target, law
-        self._inner_steps = inner_steps
-        self._members = members
+        self._chased = Chased(basis, target, law)
+        self._inner_steps, self._members = inner_steps, members
         self._sizes = torch.tensor([each.rows for each in members], dtype=torch.int64, device="cpu")
         self._first = torch.tensor([each.first for each in members], dtype=torch.int64, device="cpu")
         self._own = tuple(own)
         self._errors = StateErrorPass(basis, target) if errors is None else errors
-        self._rows = _RowRecord(0)
-        self._kept: _RowRecord | None = None  # of all rows, the ones before those taken in now filled in
+        self._rows, self._all = _RowRecord(0), _RowRecord(0)  # those taken in now, and all of the batch
 
     def next_rows(self) -> None:
         """Say that the next pieces begin at time 0 again, with further rows of the batch."""
-        if self._kept is None:
-            self._kept = _RowRecord(0)
-        self._kept.fill(self._rows.finished(), int(self._sizes.sum()))
+        self._gathered()
         self._rows = _RowRecord(self._rows.first + len(self._rows.diverged))
 
     def add(self, result: ChaseResult) -> None:
@@ -302,7 +298,6 @@ class ChaseMetrics:
         x, excess, before = result.state[:, at], result.excess[:, at], result.excess_before[:, at]
         value = result.value[:, at]
         errors = self._errors(x, result.coefficients[:, at], result.ideal_weights[:, at])
-        chased = Chased(self._basis, self._target, self._law)
         rows.keep_worst(
             settled,
             ultimate_error=(value - result.estimate[:, at]).abs(),
@@ -315,9 +310,9 @@ class ChaseMetrics:
             rounding_floor=torch.finfo(value.dtype).eps * value.abs(),
             gradient_error=errors.gradient_error,
             condition_number=errors.condition_number,
-            **{metric.name: metric.badness(result, chased)[:, at] for metric in self._own},
+            **{metric.name: metric.badness(result, self._chased)[:, at] for metric in self._own},
         )
-        rate = over_rows(self._law.contraction, errors.condition_number)
+        rate = over_rows(self._chased.law.contraction, errors.condition_number)
         if rate is None:
             return
         rounding = 1e3 * torch.finfo(x.dtype).eps * errors.native_square.abs()
@@ -364,11 +359,8 @@ class ChaseMetrics:
 
     def _gathered(self) -> _RowRecord:
         """All rows as one."""
-        last = self._rows.finished()
-        if self._kept is None:
-            return last
-        self._kept.fill(last, len(self._kept.diverged))
-        return self._kept
+        self._all.fill(self._rows.finished(), int(self._sizes.sum()))
+        return self._all
 
     def _summary(
         self,
@@ -418,7 +410,7 @@ class _RowRecord:
             self.worst[name] = torch.maximum(self.worst[name], worst) if name in self.worst else worst
 
     def finished(self) -> _RowRecord:
-        """Return a copy without the history of the excess, which has been read."""
+        """Return this, without the history of the excess, which has been read."""
         if self.early and self.worst:
             early = torch.cat(self.early, dim=1)
             index = torch.arange(1, early.shape[1] + 1, device=early.device)

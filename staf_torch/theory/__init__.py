@@ -1,17 +1,12 @@
 """The theorems, computable: what can be said before a run."""
 
-from .exponential_bound import Construction as Construction
-from .exponential_bound import ExponentialBound as ExponentialBound
 from .exponential_bound import exponential_bound as exponential_bound
 from .exponential_bound import one_polynomial_bound as one_polynomial_bound
-from .minimal_count import MinimalCount as MinimalCount
 from .minimal_count import layout_errors as layout_errors
 from .minimal_count import minimal_count as minimal_count
 from .minimal_count import power_function as power_function
 from .minimal_count import standard_layouts as standard_layouts
 from .ultimate_bound import DriftConstants as DriftConstants
-from .ultimate_bound import PaperStep as PaperStep
-from .ultimate_bound import UltimateBound as UltimateBound
 from .ultimate_bound import drift_constants as drift_constants
 from .ultimate_bound import paper_step as paper_step
 from .ultimate_bound import step_for_bound as step_for_bound

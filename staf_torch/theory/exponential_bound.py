@@ -31,13 +31,6 @@ class Construction:
     x + l/m, |l|/m <= degree/m < radius. It is evaluated in this product form only. The binomial sum over
     the centers, as printed, needs weights of the size m^degree and loses every digit.
 
-    Example:
-        >>> found = theory.one_polynomial_bound(targets.Paper(), theory.disc(), 0.1, 0.1)
-        >>> found.error <= 0.1, found.m
-        (True, 11)
-
-        Shown by `staf experiment=exponential_bound`.
-
     Source: Rosenfeld et al., section 4, proof of the theorem on the exponential kernel.
     """
 
@@ -206,15 +199,7 @@ class DomainProblem(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class ExponentialBound:
-    """Result of `exponential_bound`.
-
-    Example:
-        >>> found = theory.exponential_bound(targets.Paper(), theory.disc(), 0.1, 0.1)
-        >>> found.one_polynomial.error <= 0.1, found.N >= 1
-        (True, True)
-
-        Shown by `staf experiment=exponential_bound`.
-    """
+    """Result of `exponential_bound`."""
 
     N: int  # degree of the polynomials that approximate V
     S: int  # degree of the polynomials that approximate e^{-x'y}

@@ -29,16 +29,7 @@ _MOST_CENTERS = 500
 
 @dataclasses.dataclass(frozen=True)
 class MinimalCount:
-    """Result of `minimal_count`, over L layouts and the states (...) of a trajectory.
-
-    Example:
-        >>> x = torch.tensor([[1.0, 0.5]]).double()
-        >>> found = theory.minimal_count(targets.Paper(), ExponentialKernel(), x, 0.1, 1e-2)
-        >>> found.count, found.pointwise
-        (6, tensor([6]))
-
-        Shown by `staf experiment=feasibility`.
-    """
+    """Result of `minimal_count`, over L layouts and the states (...) of a trajectory."""
 
     count: int  # the smallest M that does for all states
     pointwise: Tensor  # (...) int64, the smallest M that does for each state

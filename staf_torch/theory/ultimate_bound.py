@@ -38,14 +38,7 @@ class DriftConstants(NamedTuple):
 
 
 class UltimateBound(NamedTuple):
-    """limsup of the excess F(a_k) - F(w_k); inf where nothing is promised.
-
-    Example:
-        >>> theory.UltimateBound(before=0.35, after=0.2).after
-        0.2
-
-        Shown by `staf experiment=laws`.
-    """
+    """limsup of the excess F(a_k) - F(w_k); inf where nothing is promised."""
 
     before: float  # as brought to x_k
     after: float  # as corrected at x_k
@@ -223,14 +216,7 @@ def _way(constants: DriftConstants, dt: float) -> float:
 
 
 class PaperStep(NamedTuple):
-    """The constants of the gradient chase theorem over given states, and the step that they allow.
-
-    Example:
-        >>> theory.PaperStep._fields[:2]  # see `paper_step`
-        ('dt', 'contraction')
-
-        Shown by `staf experiment=laws`.
-    """
+    """The constants of the gradient chase theorem over given states, and the step that they allow."""
 
     dt: float  # s
     contraction: float  # delta, of one iteration

@@ -189,7 +189,7 @@ def test_spaces_are_the_limit_of_states_and_the_bounds_of_inputs() -> None:
     many = envs.PlantVectorEnv("Pendulum", num_envs=3, bound=2.5, limit=7.0)
     assert box(many.single_observation_space) == ([-7.0] * 2, [7.0] * 2, np.float64)
     assert box(many.action_space) == ([[-2.5]] * 3, [[2.5]] * 3, np.float64)
-    assert (many.num_envs, many.spread) == (3, systems.Pendulum.spread)
+    assert (many.num_envs, many.spread.tolist()) == (3, [systems.Pendulum.spread] * 2)
     bounded = adp.BoundedInputCost(1.0, 1.0, dim=2, inputs=1, bound=3.0)
     assert box(envs.PlantEnv("TwoState", bounded).action_space)[:2] == ([-3.0], [3.0])
     assert box(envs.PlantEnv("TwoState", bounded, bound=2.0).action_space)[:2] == ([-2.0], [2.0])

@@ -101,7 +101,6 @@ class SampledProblem(nn.Module, metaclass=OfRows):
     ) -> None:
         super().__init__()
         self.step = step
-        self.holding: Holding | None = None  # of a plant in continuous time
         self.path: Path | None = path
         self.dim = integer("SampledProblem", "dim", dim, least=1)
         self.inputs = integer("SampledProblem", "inputs", inputs, least=1)
@@ -185,12 +184,11 @@ class SampledProblem(nn.Module, metaclass=OfRows):
         h = own_period("SampledProblem.of", plant, dt)
 
         box = cost.bounds
-        holding: Holding | None = None
         step: StepFunction = partial(_stepped, plant, cost)
         if plant.period is None:
             holding = Holding("SampledProblem.of", plant, cost, h, substeps).checked()
             step = partial(_held, plant, cost, h) if holding.classical else holding
-        problem = cls(
+        return cls(
             step,
             dim=cost.dim,
             inputs=cost.inputs,
@@ -202,8 +200,6 @@ class SampledProblem(nn.Module, metaclass=OfRows):
             path=cost.path if isinstance(cost, TrackingCost) else None,
             terminal=cost.ending if terminal is None else terminal,
         )
-        problem.holding = holding
-        return problem
 
     def advance(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
         """x+ and the cost of the step: (..., n), (..., m) -> (..., n), (...)."""

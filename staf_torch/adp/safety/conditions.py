@@ -105,16 +105,9 @@ class Conditions(nn.Module):
         if not self.moving:  # one time says it all
             x, t = x[:_PROBES], t[:_PROBES]
         self.degree = self._degrees(degree, x, t)
-        found = _brakes(self, x, t)
-        self.braked, self.limited, self.weak = found.braked, found.limited, found.weak
-        self.apart = found.apart
-        for name, numbers in (("frail", found.frail), ("brakes", found.constant), ("usual", found.usual)):
-            self.register_buffer(name, numbers)
-        self.frail: Tensor | None  # (k,) 1 where a row's own brakes are weak; None where rows are alike
-        self.brakes: Tensor  # (k,)
-        self.usual: Tensor  # (k,)
+        slowest = self._find_brakes(x, t)
         if decay is None:
-            self.register_buffer("decay", found.decay.to(self.decay))
+            self.register_buffer("decay", slowest.to(self.decay))
         second = torch.tensor(self.degree, dtype=torch.int64, device=self.decay.device) == 2
         if bool((second & (self.decay * self.hold > 1)).any()):
             rule = f"must be at most 1/dt = {1 / self.hold:g} where the relative degree is two"
@@ -249,7 +242,7 @@ class Conditions(nn.Module):
         brakes are one number: the speed at the end can be stopped.
         """
         value, rate, _, last_value, last_rate, _ = ends
-        speed = _speed(rate)
+        speed = speed_of(rate)
         least = _RESERVE * speed * self.hold
         room = (1 - _RESERVE) * torch.where(value > least, value, least)
         asked = 0.5 * self.hold * speed.square() / torch.where(speed > 0, room, 1.0) - speed
@@ -258,7 +251,7 @@ class Conditions(nn.Module):
         free = torch.ones_like(rate)
         if self.braked[k]:
             most = (1 - _RESERVE) * self.brakes[k].to(rate)
-            left = 2 * most * last_value - _speed(last_rate).square()
+            left = 2 * most * last_value - speed_of(last_rate).square()
             free = torch.where(value > 0, left / (most * self.hold + rate.abs()), free)
         return torch.where(fast, last_rate - asked, free)
 
@@ -302,18 +295,50 @@ class Conditions(nn.Module):
                 return which
         return 0
 
-
-class _Brakes(NamedTuple):
-    """The authority of the inputs over every constraint, found at states around the equilibrium."""
-
-    braked: tuple[bool, ...]  # whether the largest h'' is the same everywhere, positive and finite
-    constant: Tensor  # (k,) it; inf where it is not
-    limited: tuple[bool, ...]  # whether bounds limit what the inputs can do
-    usual: Tensor  # (k,) what they can add a unit of the gradient; inf where nothing limits it
-    weak: tuple[bool, ...]  # whether there are edges, h = h' = 0, at which they cannot hold it, in any row
-    frail: Tensor | None  # (k,) 1 where that is so in a row; None where all rows are alike
-    apart: bool  # whether all are constant, and braking for one never drives another
-    decay: Tensor  # (k,) by default
+    @torch.no_grad()
+    def _find_brakes(self, x: Tensor, t: Tensor) -> Tensor:
+        """Find the authority of the inputs over every constraint at states around the equilibrium, and return
+        the decays that it allows, (k,)."""
+        lean, slopes = Lean(*self.every(self.lean, x, t)), self.every(self.level, x, t)[2].sqrt()
+        count, fastest = len(self.constraints), x.new_tensor(1 / (_PERIODS * self.hold))
+        rest, slope, bounds = self.plant.resting_input().to(x), lean.slope, self.bounds.on(x.device)
+        own = torch.where(slope > 0, slope * (bounds.high - rest), slope * (bounds.low - rest))
+        sure = torch.where(torch.isfinite(own), own, 0.0).sum(-1)  # of the inputs that have bounds
+        none, braked, limited, weak = x.new_tensor(math.inf), [], [], []
+        repeats = len(TIMES) * _PROBES // len(x)  # of a constraint that stands still, one a time
+        constant, usual, decays = [], [], []
+        for k in range(count):
+            value, reach, ability = lean.value[:, k], sure[:, k], lean.ability[:, k]
+            inside = (value > 0) & (reach > _NOTHING)
+            within = bool(inside.any()) and bool(torch.isfinite(ability).all())
+            ratio = torch.where(inside, reach / slopes[:, k], torch.nan)
+            usual.append(known_quantile(ratio.repeat(repeats), _RARE) if within else none)
+            same = within and self.degree[k] == 2 and _same(ability) and _same(lean.slope[:, k])
+            good = same and bool(ability[0] > _NOTHING)
+            constant.append(ability[0] if good else none)
+            unsure, middle = within and not good, torch.where(inside, reach, torch.nan).nanmedian()
+            weak.append(_weakness(self, k, x, t, middle) if unsure else torch.zeros_like(none))
+            slowest = _decay(value, reach, inside) if within and self.degree[k] == 2 else fastest
+            decays.append(torch.minimum(slowest, fastest))
+            braked.append(good)
+            limited.append(within)
+        any_weak = tuple(in_any_row(each > 0) for each in weak)
+        alone = all(braked[k] or self.degree[k] == 1 or not limited[k] for k in range(count))
+        second = [k for k in range(count) if self.degree[k] == 2]
+        apart = all(_apart(lean, i, j) for i in second for j in second if j < i)
+        own, most, often, rates = (torch.stack(each).detach() for each in (weak, constant, usual, decays))
+        # Whether the largest h'' is the same everywhere, positive and finite; whether bounds limit what the
+        # inputs can do; whether there are edges, h = h' = 0, at which they cannot hold it, in any row.
+        self.braked, self.limited, self.weak = tuple(braked), tuple(limited), any_weak
+        # Whether all are constant, and braking for one never drives another.
+        self.apart = alone and apart and not any(any_weak)
+        self.register_buffer("frail", None if all(map(agreed, weak)) else own)
+        self.frail: Tensor | None  # (k,) 1 where a row's own brakes are weak; None where rows are alike
+        self.register_buffer("brakes", most)
+        self.brakes: Tensor  # (k,) the largest h'' where it is the same everywhere; inf where it is not
+        self.register_buffer("usual", often)
+        self.usual: Tensor  # (k,) what the inputs can add a unit of the gradient; inf where nothing limits it
+        return rates
 
 
 def _reachable(end: Tensor, bounds: Bounds, rest: Tensor) -> Tensor:
@@ -326,46 +351,6 @@ def _reachable(end: Tensor, bounds: Bounds, rest: Tensor) -> Tensor:
     known = torch.where(finite, both, 0.0).abs()
     far = _FAR * known.max()
     return torch.where(torch.isfinite(end), end, rest.to(end) + torch.sign(end) * far)
-
-
-@torch.no_grad()
-def _brakes(of: Conditions, x: Tensor, t: Tensor) -> _Brakes:
-    lean, slopes = Lean(*of.every(of.lean, x, t)), of.every(of.level, x, t)[2].sqrt()
-    count, fastest = len(of.constraints), x.new_tensor(1 / (_PERIODS * of.hold))
-    rest, slope, bounds = of.plant.resting_input().to(x), lean.slope, of.bounds.on(x.device)
-    own = torch.where(slope > 0, slope * (bounds.high - rest), slope * (bounds.low - rest))
-    sure = torch.where(torch.isfinite(own), own, 0.0).sum(-1)  # of the inputs that have bounds
-    none, braked, limited, weak = x.new_tensor(math.inf), [], [], []
-    repeats = len(TIMES) * _PROBES // len(x)  # of a constraint that stands still, one a time
-    constant, usual, decays = [], [], []
-    for k in range(count):
-        value, reach, ability = lean.value[:, k], sure[:, k], lean.ability[:, k]
-        inside = (value > 0) & (reach > _NOTHING)
-        within = bool(inside.any()) and bool(torch.isfinite(ability).all())
-        ratio = torch.where(inside, reach / slopes[:, k], torch.nan)
-        usual.append(known_quantile(ratio.repeat(repeats), _RARE) if within else none)
-        same = within and of.degree[k] == 2 and _same(ability) and _same(lean.slope[:, k])
-        good = same and bool(ability[0] > _NOTHING)
-        constant.append(ability[0] if good else none)
-        unsure, middle = within and not good, torch.where(inside, reach, torch.nan).nanmedian()
-        weak.append(_weakness(of, k, x, t, middle) if unsure else torch.zeros_like(none))
-        slowest = _decay(value, reach, inside) if within and of.degree[k] == 2 else fastest
-        decays.append(torch.minimum(slowest, fastest))
-        braked.append(good)
-        limited.append(within)
-    any_weak = tuple(in_any_row(each > 0) for each in weak)
-    alone = all(braked[k] or of.degree[k] == 1 or not limited[k] for k in range(count))
-    apart = (
-        alone
-        and not any(any_weak)
-        and all(
-            _apart(lean, i, j) for i in range(count) for j in range(i) if of.degree[i] == of.degree[j] == 2
-        )
-    )
-    numbers = map(torch.stack, (constant, usual, decays, weak))
-    most, often, rates, own = (each.detach() for each in numbers)
-    frail = None if all(map(agreed, weak)) else own
-    return _Brakes(tuple(braked), most, tuple(limited), often, any_weak, frail, apart, rates)
 
 
 def _decay(value: Tensor, reach: Tensor, inside: Tensor) -> Tensor:
@@ -407,7 +392,7 @@ def _weakness(of: Conditions, k: int, x: Tensor, t: Tensor, usual: Tensor) -> Te
     return weak.to(x) if of.degree[k] == 2 else x.new_tensor(float(bool(weak)))
 
 
-def _speed(rate: Tensor) -> Tensor:
+def speed_of(rate: Tensor) -> Tensor:
     """Return how fast h falls, at least 0."""
     return torch.where(rate < 0, -rate, 0.0)
 

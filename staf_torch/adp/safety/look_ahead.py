@@ -12,7 +12,6 @@ nonlinear systems", IEEE Access (2020): a set that a backup law keeps.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -22,7 +21,7 @@ from ...lanes.gradients import grad, jacrev
 from ...lanes.per_row.decisions import in_any_row, is_of_rows
 from ...lanes.trace.loops import repeat_counted
 from ..loop.controller import Policy
-from .conditions import Conditions, Ends, Lean
+from .conditions import Conditions, Ends, Lean, speed_of
 
 _BRAKING, _SHARE = 48, 8.0  # steps of the hardest brake; each at least a period and 1/8 of what is left
 _FEWEST, _FOLLOWED, _CONSTANTS = 20, 300, 4.0  # periods of the policy; time constants of its slowest mode
@@ -32,21 +31,6 @@ _BACK = 0.5  # of x'Px, to which the policy must have brought the state
 _ROUNDED = 1e-9  # of h, by which an edge may be missed
 _UNSTABLE = 0.01  # of the fastest mode, from which on one that grows counts
 _NEVER = 1e6  # s, for which what no brake slows goes on
-
-
-class Opposed(NamedTuple):
-    """The rest of the plant under braking along an edge, linearised at the equilibrium."""
-
-    rate: Tensor  # (k,) 1/s, of the fastest growth; at most 0 where nothing runs away
-    alone: Tensor | None  # () 1/s, of the slowest mode under the policy alone; None where it is not known
-    bowl: Tensor | None  # P of x'Px, which falls under the policy
-
-
-class Chosen(NamedTuple):
-    """The control that keeps what can be kept."""
-
-    control: Tensor  # (B, m)
-    left: Tensor  # (B,) by how much h - margin stays above min(0, what it is now): negative where it cannot
 
 
 class LookAhead(nn.Module):
@@ -61,9 +45,8 @@ class LookAhead(nn.Module):
     def __init__(self, conditions: Conditions, policy: Policy | None) -> None:
         super().__init__()
         self.conditions = conditions
-        found = opposition(conditions, policy)
-        self.against = found.rate
-        self.opposed = bool((found.rate > 0).any())
+        self.against, alone, bowl = opposition(conditions, policy)
+        self.opposed = bool((self.against > 0).any())
         self.weak = any(conditions.weak)
         frail = conditions.frail
         if self.opposed and frail is not None:  # what is followed differs too: rows part
@@ -71,13 +54,13 @@ class LookAhead(nn.Module):
         self.register_buffer("frail", None if frail is None else frail.amax())
         self.frail: Tensor | None  # () 1 where a row's own brakes are weak; None where rows are alike
         self.acts = any(conditions.limited) or self.opposed
-        self.by_policy = policy is not None and (self.weak or (self.opposed and found.alone is not None))
+        self.by_policy = policy is not None and (self.weak or (self.opposed and alone is not None))
         self.by_brakes = not (self.opposed and self.by_policy)
         if self.opposed and not self.by_policy:
             self.acts = False  # nothing tells what becomes of a state
         self.periods, self.counted, count = _FEWEST, False, conditions.decay.new_tensor(float(_FEWEST))
         if self.by_policy:
-            slow = (-(torch.zeros_like(count) if found.alone is None else found.alone)).clamp(min=1e-9)
+            slow = (-(torch.zeros_like(count) if alone is None else alone)).clamp(min=1e-9)
             periods = (_CONSTANTS / slow / conditions.hold).ceil().clamp(max=_FOLLOWED)
             count = torch.maximum(count, periods)
             if self.frail is not None:
@@ -92,7 +75,7 @@ class LookAhead(nn.Module):
             hold = torch.maximum(hold, 0.5 / _fastest(conditions).clamp(min=1e-9))
         self.register_buffer("longest", hold)
         self.longest: Tensor  # ()
-        self.register_buffer("bowl", found.bowl if self.opposed and self.by_policy else None)
+        self.register_buffer("bowl", bowl if self.opposed and self.by_policy else None)
         self.bowl: Tensor | None
 
     def asked(self, x: Tensor, u: Tensor, t: Tensor, strain: Tensor) -> Tensor:
@@ -104,14 +87,16 @@ class LookAhead(nn.Module):
             x, u, t = given
             end = of.halfway(of.halfway(x, u), u)
             lean = Lean(*of.every(of.lean, end, t + of.hold))
-            need = _speed(lean).square() > 2 * _URGENT * lean.ability * lean.value
+            need = speed_of(lean.rate).square() > 2 * _URGENT * lean.ability * lean.value
             return (second & (lean.rate < 0) & (lean.value > 0) & need).any(-1).to(x)
 
         return where_rows(strain > 0, urgent, (x, u, t), torch.zeros_like(t)) > 0
 
-    def choose(self, policy: Policy | None, given: tuple[Tensor, ...], where: Tensor) -> Chosen:
-        """Return the first control whose consequences are fine, else the one of the best, in the rows
-        ``where`` (B,)."""
+    def choose(
+        self, policy: Policy | None, given: tuple[Tensor, ...], where: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return the first control (B, m) whose consequences are fine, else the one of the best, in the rows
+        ``where`` (B,), and by how much h - margin stays above min(0, its value now), at most 0."""
         wanted, found, x, t = given
         none = torch.zeros_like(t)
         start = wanted, found, x, t, found, none - math.inf, none, where
@@ -136,7 +121,7 @@ class LookAhead(nn.Module):
             return wanted, found, x, t, best, left, count, (left < -_ROUNDED) & (count < 4)
 
         _, _, _, _, control, left, _, _ = repeat(4, further, start, where=lambda now: now[7])
-        return Chosen(control, torch.where(left < -_ROUNDED, left, 0.0))
+        return control, torch.where(left < -_ROUNDED, left, 0.0)
 
     def hardest(self, lean: Lean) -> Tensor:
         """The control that brakes as hard as can be, for what is most urgent: (B, m)."""
@@ -145,7 +130,9 @@ class LookAhead(nn.Module):
         room = torch.where(lean.value > _ROUNDED, lean.value, _ROUNDED)
         able = torch.where(lean.ability > _ROUNDED, lean.ability, _ROUNDED)
         away = torch.where(lean.drift < 0, -lean.drift, 0.0)
-        urgency = torch.where(second, 0.5 * _speed(lean).square() / (room * able), of.hold * away / room)
+        urgency = torch.where(
+            second, 0.5 * speed_of(lean.rate).square() / (room * able), of.hold * away / room
+        )
         most = urgency.amax(-1, keepdim=True)
         weight = (urgency / torch.where(most > 0, most, 1.0)) ** 4
         length = lean.slope.square().sum(-1).sqrt()
@@ -165,8 +152,9 @@ class LookAhead(nn.Module):
         later, time = torch.full_like(t, -math.inf), t + of.hold
         least = torch.where(ends.value < 0, ends.value, 0.0)
         if self.by_brakes and of.apart:
-            speed = torch.where(ends.last_rate < 0, -ends.last_rate, 0.0)
-            stopped = ends.last_value - 0.5 * speed.square() / of.brakes.to(ends.value)  # by constant brakes
+            stopped = ends.last_value - 0.5 * speed_of(ends.last_rate).square() / of.brakes.to(
+                ends.value
+            )  # by constant brakes
             later = (stopped - least).amin(-1)
         elif self.by_brakes:
             later = (self._braked(end, time, strength) - least).amin(-1)
@@ -198,7 +186,7 @@ class LookAhead(nn.Module):
             x, t, value, rate, _, least, strength, _ = now
             lean = Lean(*of.every(of.lean, x, t))
             able = torch.where(lean.ability > 0, lean.ability, 1.0)
-            left = torch.where(second & (lean.ability > 0), _speed(lean) / able, 0.0).amax(-1) / _SHARE
+            left = torch.where(second & (lean.ability > 0), speed_of(lean.rate) / able, 0.0).amax(-1) / _SHARE
             length = torch.where(left > of.hold, torch.where(left < longest, left, longest), of.hold)
             u = rest + strength * (self.hardest(lean) - rest)
             x, t, ends = self._moved(x, u, t, value, rate, length)
@@ -208,7 +196,7 @@ class LookAhead(nn.Module):
 
         done = repeat(_BRAKING, brake, start, where=lambda now: now[7])
         _, _, value, rate, ability, least, _, going = done
-        speed = torch.where(rate < 0, -rate, 0.0)
+        speed = speed_of(rate)
         able = torch.where(ability > 0, ability, 1.0)
         far = torch.where(ability > 0, 0.5 * speed.square() / able, _NEVER * speed)
         far = torch.where(second, far, torch.where(ability < 0, -_NEVER * ability, 0.0))
@@ -257,7 +245,7 @@ class LookAhead(nn.Module):
         return x, t, Ends(value, rate, between, *of.every(of.level, x, t))
 
 
-def opposition(of: Conditions, policy: Policy | None) -> Opposed:
+def opposition(of: Conditions, policy: Policy | None) -> tuple[Tensor, Tensor | None, Tensor | None]:
     """Find what braking along every edge does to the rest of the plant: the modes of
 
         x' = (A - B K) x - B s'/(s s') phi (A - B K + decay) x,
@@ -265,8 +253,11 @@ def opposition(of: Conditions, policy: Policy | None) -> Opposed:
     in which the barrier's condition holds with equality, phi the row of the constraint's last derivative
     (plus decay times h) and s = its product with B. A mode that grows there, faster than under the policy
     alone, is an unstable zero: the constraint's coordinate must first move the wrong way.
+
+    Returns:
+        The rate of its growth, (k,) 1/s, at most 0 where nothing runs away; that of the slowest mode under
+        the policy alone, (), None where it is not known; and P of x'Px, which falls under the policy.
     """
-    none = Opposed(torch.zeros_like(of.decay), None, None)
     plant = of.plant
     rest, at = plant.resting_input().double(), plant.equilibrium().double()
     try:
@@ -278,7 +269,7 @@ def opposition(of: Conditions, policy: Policy | None) -> Opposed:
     a, b, gain = a.detach(), b.detach(), gain.detach().to(a)
     closed = a - b @ gain
     if not bool(torch.isfinite(closed).all()):
-        return none
+        return torch.zeros_like(of.decay), None, None
     modes = torch.linalg.eigvals(closed)
     alone, fast = None if policy is None else modes.real.max(), modes.abs().max()
     lost = torch.zeros_like(fast > 0) if alone is None else alone > _UNSTABLE * fast  # nothing comes back
@@ -301,7 +292,7 @@ def opposition(of: Conditions, policy: Policy | None) -> Opposed:
         )  # A'P + PA = -1
         bowl = torch.linalg.solve(torch.kron(eye, turned) + torch.kron(turned, eye), -eye.flatten())
         bowl = bowl.unflatten(0, eye.shape)
-    return Opposed(rate, alone, bowl)
+    return rate, alone, bowl
 
 
 def _growth(
@@ -327,7 +318,3 @@ def _fastest(of: Conditions) -> Tensor:
     a = jacrev(of.plant.motion)(at, rest).detach()
     finite = torch.isfinite(a).all()
     return torch.where(finite, torch.linalg.matrix_norm(torch.where(finite, a, 0.0)), torch.inf)
-
-
-def _speed(lean: Lean) -> Tensor:
-    return torch.where(lean.rate < 0, -lean.rate, 0.0)

@@ -382,12 +382,12 @@ class SafetyFilter(Controller, DecidedByRows):
                 astray = look.to(x)
             elif self.ahead.weak:
                 look = t == t if self.ahead.frail is None else look | (self.ahead.frail > 0)
-            chosen = self.ahead.choose(self._policy, (at, u, x, t), look)
-            u = torch.where(look.unsqueeze(-1), chosen.control, u)
+            chosen, left = self.ahead.choose(self._policy, (at, u, x, t), look)
+            u = torch.where(look.unsqueeze(-1), chosen, u)
             # A barrier of degree two that the bounds cannot meet is no loss where the brakes do.
             forgiven = slack if 1 in self.degree and not self.ahead.opposed else torch.zeros_like(slack)
-            slack = torch.where(look & (chosen.left == 0), forgiven, slack)
-            short = torch.where(look, torch.maximum(short, -chosen.left), short)
+            slack = torch.where(look & (left == 0), forgiven, slack)
+            short = torch.where(look, torch.maximum(short, -left), short)
         missing = where_rows(short > 0, self._lacking, (x, t, short), slack)
         slack = torch.where(short > 0, torch.maximum(slack, missing), slack)
         more = (slack, astray) if self.ahead.opposed else (slack,)
