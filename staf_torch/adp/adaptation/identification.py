@@ -258,7 +258,7 @@ class LeastSquares(metaclass=OfRows):
     that is not finite, as of a missing measurement, is left out and counted: `Estimate.missed`.
 
     Example:
-        >>> from staf_torch.adp.adaptation.windows import Equation
+        >>> from staf_torch.adp.adaptation.identification import Equation
         >>> law = adp.LeastSquares([0.0, 0.0], deviation=10.0, floor=1e-6)
         >>> now = law.init(torch.zeros(1, 2).double())
         >>> s = torch.tensor([[[1.0, 2.0], [1.0, -1.0]]]).double()
