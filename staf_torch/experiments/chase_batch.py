@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
@@ -66,18 +67,14 @@ def simulate(
         errors: of their metrics, where all have the same basis, target and initial states.
     """
     objects = [_Objects.of(problem) for problem in problems]
-
-    def run(
-        jobs: Sequence[int], parts: _Objects, rows: RowsOfJobs, advance: Callable[[int], None] | None
-    ) -> list[Outcome]:
-        members = [_BatchMember(problems[i], sinks[i], drawn[i]) for i in jobs]
-        return _run(members, parts, rows, advance, errors, alone=len(problems) == 1)
+    asked = [*zip(problems, sinks, drawn, strict=True)]
 
     def alike(i: int) -> tuple[object, ...]:
         own = problems[i].metrics  # of the user's, which see one problem at a time
         return problems[i].dt, *map(id, own), *(map(id, objects[i]) if own else ())
 
     counts = [len(problem.initial_states) for problem in problems]
+    run = functools.partial(_run, asked, errors)
     return in_calls(run, objects, counts, [alike(i) for i in range(len(problems))], advance)
 
 
@@ -102,18 +99,18 @@ class _Objects(NamedTuple):
 
 
 def _run(
-    members: Sequence[_BatchMember],
+    asked: Sequence[tuple[ChaseProblem, Sink | None, bool]],
+    errors: StateErrorPass | None,
+    jobs: Sequence[int],
     parts: _Objects,
     rows: RowsOfJobs,
     advance: Callable[[int], None] | None,
-    errors: StateErrorPass | None,
-    *,
-    alone: bool,
 ) -> list[Outcome]:
-    """Run problems of the same dt as one batch, with the objects and rows of all of them.
+    """Run ``jobs`` of all that is ``asked``, of the same dt, as one batch with their objects and rows.
 
-    Unless one problem is ``alone``, each member keeps the warnings about its own rows.
+    Unless there is one problem in all, each member keeps the warnings about its own rows.
     """
+    members, alone = [_BatchMember(*asked[i]) for i in jobs], len(asked) == 1
     first, basis = members[0].problem, parts.basis
     times, starts = first.steps + 1, torch.cat([member.problem.initial_states for member in members])
     windows = [Member(m.rows, m.problem.dt, m.problem.settle_time) for m in members]

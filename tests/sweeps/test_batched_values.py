@@ -20,7 +20,7 @@ from staf_torch.experiments.adp import LoopSolution, Regulation
 from staf_torch.experiments.gradient_chase import ChaseSolution, GradientChase
 from staf_torch.results import run_record
 from staf_torch.signs import SHOWN
-from staf_torch.sweeps import batching
+from staf_torch.sweeps import job
 from staf_torch.sweeps.hydra_compat import parse_override
 from staf_torch.sweeps.job import DEFERRED, Computed, Failed, Outcome
 
@@ -42,15 +42,15 @@ def compose(base: Sequence[str], lines: Sequence[str]) -> list[DictConfig]:
 
 
 def solve(cfgs: Sequence[DictConfig]) -> list[Outcome]:
-    return batching.solve(cfgs, SHOWN)
+    return job.solve(cfgs, SHOWN)
 
 
-def flat(cfgs: Sequence[DictConfig]) -> list[batching.Flat]:
+def flat(cfgs: Sequence[DictConfig]) -> list[job.Flat]:
     return [run_record.flat(cfg) for cfg in cfgs]
 
 
 def groups(cfgs: Sequence[DictConfig]) -> list[list[int]]:
-    return batching.groups(flat(cfgs))
+    return job.groups(flat(cfgs))
 
 
 def solutions(cfgs: Sequence[DictConfig]) -> list[ChaseSolution]:
@@ -97,7 +97,7 @@ def test_a_member_gets_what_it_gets_alone(name: str) -> None:
     cfgs = compose(base, [*STARTS, *lines])
     (group,) = groups(cfgs)
     assert group == list(range(len(cfgs)))
-    together = GradientChase().solve(cfgs, SHOWN)  # raises where `batching.solve` would run each alone
+    together = GradientChase().solve(cfgs, SHOWN)  # raises where `job.solve` would run each alone
     digits = 1e-9 if name != "single precision" else 1e-3
     cfg, found = chosen(name, cfgs, together)
     (alone,) = solutions([cfg])
@@ -226,7 +226,7 @@ def test_writing_what_was_solved_leaves_what_a_run_leaves(tmp_path: Path) -> Non
     for name, cfg in (("batch", cfgs[0]), ("alone", cfgs[0])):
         (tmp_path / name).mkdir()
         outcome = DEFERRED if name == "alone" else solved[0]
-        batching.completion(cfg, outcome)(cfg, tmp_path / name)
+        job.completion(cfg, outcome)(cfg, tmp_path / name)
     files = [{p.name: p for p in (tmp_path / name).iterdir()} for name in ("batch", "alone")]
     assert files[0].keys() == files[1].keys() == {"metrics.json", "history.npz"}
     with np.load(files[0]["history.npz"]) as found, np.load(files[1]["history.npz"]) as expected:

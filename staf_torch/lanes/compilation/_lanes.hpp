@@ -99,6 +99,9 @@ INLINE bool any(M m) {
 #elif LANES_512
     typedef long long Longs __attribute__((vector_size(64)));
     return __builtin_ia32_ptestmq512((Longs)m, (Longs)m, -1) != 0;
+#elif defined(__AVX__)
+    typedef long long Longs __attribute__((vector_size(32)));
+    return !__builtin_ia32_ptestz256((Longs)m, (Longs)m);
 #else
     const M none = M{} != M{};
     return __builtin_memcmp(&m, &none, sizeof m) != 0;
