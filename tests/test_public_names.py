@@ -9,6 +9,7 @@ from __future__ import annotations
 import ast
 import doctest
 import functools
+import html
 import importlib
 import inspect
 import re
@@ -24,6 +25,7 @@ from command_line import ROOT, environment
 
 import staf_torch
 from staf_torch.cli.site import build
+from staf_torch.cli.site.formulas import typeset
 from staf_torch.cli.site.pages import public_names
 from staf_torch.lanes.compilation import compiler
 from staf_torch.sweeps.python_api import Runs, sweep
@@ -242,6 +244,22 @@ def test_every_public_name_has_a_page_and_every_link_leads_somewhere(site: Path)
             text = page.read_text(encoding="utf-8")
             assert "&gt;&gt;&gt;" in text, "a page has the example of its name"
             assert "Initialize internal Module state" not in text
+
+
+@pytest.mark.parametrize(
+    ("text", "typeset_as"),
+    [
+        ("V^(y; x) = w_1 k(y, c_1(x)).", "V ^ ( y ; x ) = w 1 k ( y , c 1 ( x ) ) ."),
+        ("the rate e^{-|z|^2 / 2 width^2} of it", "the rate e \u2212 | z | 2 / 2 width 2 of it"),
+        ("M &lt;= 6, V* and (B, T, n)", "M ≤ 6 , V* and (B, T, n)"),
+        ("a plain sentence: near_optimal (see torch>=2.6)", ""),
+    ],
+)
+def test_formulas_in_text_are_typeset_and_keep_every_sign(text: str, typeset_as: str) -> None:
+    shown = typeset(text)
+    assert ("<math>" in shown) == bool(typeset_as)
+    if typeset_as:
+        assert html.unescape(re.sub(r"(<[^>]*>|\s)+", "", shown)) == typeset_as.replace(" ", "")
 
 
 def test_without_its_generator_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

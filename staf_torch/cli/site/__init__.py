@@ -1,1 +1,1 @@
-"""The site of `staf docs`: its pages and how they are built."""
+"""The site of `staf docs`: its pages, how they are built, and the formulas on them."""

@@ -140,6 +140,7 @@ def _settings(folder: Path, rooms: Sequence[str]) -> dict[str, Any]:
             "polyfills": ["iframe-worker.js", "versions.js"],  # in place of the theme's, which is on a server
         },
         "extra_css": ["style.css"],
+        "hooks": [str(_HERE / "formulas.py")],
         "plugins": [{"search": {}}, {"offline": {}}, {"mkdocstrings": {"handlers": {"python": _reader()}}}],
         "markdown_extensions": [
             "admonition",

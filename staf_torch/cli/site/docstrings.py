@@ -8,10 +8,11 @@ from typing import Any
 import griffe
 
 _EXAMPLE = re.compile(r"^Example:$", re.MULTILINE)
+_LINE = re.compile(r"^( *)([^\n]*)\n(?=\1 {4,}\S)", re.MULTILINE)
 
 
 class Docstrings(griffe.Extension):
-    """Make `Example:` the section of examples."""
+    """Make `Example:` the section of examples, and put a blank line before formulas that are indented."""
 
     def on_object(self, *, obj: griffe.Object, **kwargs: Any) -> None:
         """Rewrite the docstring of an object that was just read."""
