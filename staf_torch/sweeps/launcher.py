@@ -8,7 +8,7 @@ import functools
 import gc
 import logging
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from omegaconf import DictConfig
 from ..lanes.compilation.compiler import compiler
 from ..numerics.checks import choice, integer
 from ..results import run_record as records
-from ..results.files import ROWS, RUN, partial_name
+from ..results.files import METRICS, ROWS, RUN, partial_name
 from ..signs import Pace, Progress, Sign, write
 from . import lock, table, workers
 from .executors import Executor, compute, executor
@@ -33,6 +33,7 @@ _NOT_BATCHED = (
     "they run one by one. hydra/launcher=joblib runs them side by side"
 )
 _TOLD = 20  # failures of different reasons that are told as they happen
+_ALIKE = 8  # jobs that fail alike, whatever is swept, end a sweep
 
 
 @contextlib.contextmanager
@@ -115,6 +116,51 @@ def job_name(num: int, overrides: Sequence[str]) -> str:
     return f"job {num} ({' '.join(records.own(filter_overrides(overrides)))})"
 
 
+class AlikeFailures:
+    """Failures that have nothing to do with what is swept: all jobs so far have one reason.
+
+    It gets the overrides of all jobs, and the number of the first.
+    """
+
+    def __init__(self, jobs: Sequence[Sequence[str]], first: int = 0) -> None:
+        self._jobs, self._first = jobs, first
+        self._reason: str | None = None
+        self._failed = list[int]()
+        self._possible = True
+
+    def ended(self, num: int, failure: str | None) -> None:
+        """Note the end of a job.
+
+        Raises:
+            ValueError: if `_ALIKE` jobs failed with this reason, no other has ended, and each override that
+                differs among the jobs differs among those; others are left.
+        """
+        self._possible = self._possible and failure is not None and self._reason in (None, failure)
+        if not self._possible:  # one job went well, or failed otherwise
+            return
+        self._reason = failure
+        self._failed.append(num - self._first)
+        if len(self._failed) % _ALIKE or len(self._failed) == len(self._jobs):
+            return
+        if _differing(self._jobs) == _differing(self._jobs[failed] for failed in self._failed):
+            left = len(self._jobs) - len(self._failed)
+            raise ValueError(
+                f"{len(self._failed)} jobs failed with the same error, the other {left} were not run: "
+                f"{failure}"
+            )
+
+
+def _differing(jobs: Iterable[Sequence[str]]) -> set[int]:
+    """Return which places of the overrides hold more than one text."""
+    values: list[set[str]] = []
+    for job in jobs:
+        values += [set() for _ in job[len(values) :]]
+        for seen, line in zip(values, job, strict=False):
+            if len(seen) < 2:
+                seen.add(line)
+    return {place for place, seen in enumerate(values) if len(seen) > 1}
+
+
 class Launch:
     """A call by Hydra: a list of jobs to run, by the launcher's settings and what Hydra set up."""
 
@@ -123,6 +169,7 @@ class Launch:
         self._jobs: SweepJobs = launcher.hydra_context.config_loader
         self._task: Task = launcher.task_function
         self._directory = Path(str(launcher.config.hydra.sweep.dir))
+        self._directories: dict[int, Path] = {}  # of the jobs that ran
         if launcher.batch is not None:
             integer("hydra.launcher", "batch", launcher.batch, least=1)
         choice("hydra.launcher", "foreign", launcher.foreign, _FOREIGN)
@@ -136,11 +183,18 @@ class Launch:
             )
 
     def begin(self) -> None:
-        """Open the log of the sweep; raise ValueError if a sweep of directories is resumed as a table, or the
-        other way round."""
+        """Open the log of the sweep, and refuse a directory that has records of the other kind.
+
+        Raises:
+            ValueError: if it has.
+        """
         self._jobs.start()
         if not PRINTS.get():
             silence_terminal()
+        self._refuse_the_other_kind()
+
+    def _refuse_the_other_kind(self) -> None:
+        """Raise ValueError if a sweep of directories is resumed as a table, or the other way round."""
         names = (ROWS, partial_name(ROWS))
         rows = any((self._directory / name).exists() for name in names)
         runs = next(self._directory.glob(f"*/{RUN}"), None) is not None
@@ -156,7 +210,7 @@ class Launch:
     def fill_table(self, jobs: Sequence[Sequence[str]]) -> None:
         """Run the jobs, which leave rows of a table; raise ValueError if one failed, when all have ended."""
         progress = SweepProgress(len(jobs))
-        done, failed = 0, []
+        done, failed, alike = 0, [], AlikeFailures(jobs)
 
         def ended(num: int, failure: str | None) -> None:
             nonlocal done
@@ -164,6 +218,7 @@ class Launch:
             self._still_there(done, len(jobs))
             name = "" if failure is None else job_name(num, jobs[num])
             progress.ended(name, failure)
+            alike.ended(num, failure)
             if failure is not None:
                 failed.append((num, failure))
 
@@ -186,21 +241,30 @@ class Launch:
         records.list_jobs(self._directory, numbered)
         returns = self._finished(numbered, plan)
         progress = SweepProgress(len(numbered), len(returns))
+        alike = AlikeFailures(list(numbered.values()), min(numbered, default=0))
+        if returns:
+            alike.ended(min(returns), None)
         index = {num: i for i, num in enumerate(numbered)}
         with contextlib.closing(progress), contextlib.ExitStack() as stack, _collecting_seldom():
             for num, task in self._tasks(numbered, plan, set(returns), progress, stack):
                 workers.check()
                 self._still_there(len(returns), len(numbered))
-                ended = self._jobs.run(task, Job(self._jobs, num, numbered[num], plan, index[num]))
-                ended.cfg = ended.hydra_cfg = None  # settings of all jobs are memory
-                returns[num] = ended
-                wrong = ended.status == JobStatus.FAILED
-                why = reason(ended._return_value) if wrong else None
+                returns[num] = self._replay(task, Job(self._jobs, num, numbered[num], plan, index[num]))
+                wrong = returns[num].status == JobStatus.FAILED
+                why = reason(returns[num]._return_value) if wrong else None
                 progress.ended(job_name(num, numbered[num]), why)
-        self._still_there(len(returns), len(numbered))
-        failed = sum(job.status == JobStatus.FAILED for job in returns.values())
+                alike.ended(num, why)
+        self._refuse_lost(numbered, returns)
+        failed = sum(ended.status == JobStatus.FAILED for ended in returns.values())
         _log.info("%d of %d jobs completed, %d failed", len(numbered) - failed, len(numbered), failed)
         return [returns[num] for num in numbered]
+
+    def _replay(self, task: Task, job: Job) -> JobReturn:
+        """Run a job whose outcome is known as Hydra runs one, and keep no settings of it."""
+        self._directories[job.num] = job.directory
+        ended = self._jobs.run(task, job)
+        ended.cfg = ended.hydra_cfg = None
+        return ended
 
     def _still_there(self, done: int, jobs: int) -> None:
         """Raise OSError if the directory of the sweep was taken away: nobody wants it made anew."""
@@ -210,6 +274,18 @@ class Launch:
                 f"{self._directory} was removed or replaced while its sweep went on: stopped when {done} of "
                 f"{jobs} jobs were done, and those are lost."
             )
+
+    def _refuse_lost(self, numbered: Mapping[int, list[str]], returns: Mapping[int, JobReturn]) -> None:
+        """Turn jobs whose results have gone since they ended into failed ones."""
+        self._still_there(len(returns), len(numbered))
+        for num, directory in self._directories.items():
+            ended = returns[num]
+            complete = self._task is execute and ended.status == JobStatus.COMPLETED
+            if complete and not (directory / METRICS).exists():
+                name = job_name(num, numbered[num])
+                error = ValueError(f"the results of {name} are not in {directory} any more")
+                sys.stderr.write(f"{name} failed: {error}\n")
+                ended.status, ended.return_value = JobStatus.FAILED, error
 
     def _finished(self, numbered: Mapping[int, list[str]], plan: Plan) -> dict[int, JobReturn]:
         """Return the jobs that an earlier start of this sweep completed."""

@@ -179,6 +179,8 @@ def own(cfg: DictConfig, directory: Path, progress: Progress = SHOWN) -> Metrics
         raise RuntimeError("the second seed is unlucky")
     if harm == "Ctrl-C" and not Path("go on").exists():
         raise KeyboardInterrupt
+    if harm == "a job gone":
+        shutil.rmtree(directory.parent / "0")
     node = HydraConfig.get()
     assert node.runtime.output_dir == str(directory.absolute())
     assert json.loads((directory / "run.json").read_text())["status"] == "running"
@@ -205,13 +207,13 @@ def test_hydra_knows_of_a_job_while_it_runs_and_what_was_typed_is_kept_as_typed(
     assert "2 of 2 jobs completed" in out, err
 
 
-def test_equal_failures_are_told_once(place: Path) -> None:
+def test_equal_failures_are_told_once_and_end_a_sweep_where_nothing_swept_matters(place: Path) -> None:
     wrong = ["centers.count=4", "seed=range(5)", "kernel=exponential,gaussian", *SHORT]
     directory, said = sweep(place, "alike", *wrong, code=1)
     assert said.count(f"failed: {BAD}") == 2  # as it happened, and in the table's note
-    assert "9 more failed like job 0 (" in said
-    assert said.endswith(f"staf: {BAD}\n")
-    assert len(list(directory.glob("*/run.json"))) == 10
+    assert "7 more failed like job 0 (" in said
+    assert said.endswith(f"staf: 8 jobs failed with the same error, the other 2 were not run: {BAD}\n")
+    assert len(list(directory.glob("*/run.json"))) == 8
 
 
 def test_a_directory_is_one_jobs(place: Path) -> None:
@@ -247,6 +249,12 @@ def test_an_interrupted_sweep_says_how_to_resume(place: Path) -> None:
     assert code == 0, err
     assert "3 of 3 jobs completed" in out
     assert len(rows(directory)) == 3
+
+
+def test_results_that_are_taken_away_are_no_completed_jobs(place: Path) -> None:
+    directory, said = sweep(place, "gone", *OWN, "seed=range(2)", "+harm=a job gone", code=1)
+    assert "the results of job 0 (task=test_sweep.own" in said
+    assert [run.parent.name for run in directory.glob("*/run.json")] == ["1"]
 
 
 @pytest.mark.parametrize(
