@@ -52,8 +52,8 @@ from .planning.obstacles import plan_around as plan_around
 from .planning.receding_horizon import RecedingHorizon as RecedingHorizon
 from .planning.shooting import DirectShooting as DirectShooting
 from .planning.shooting import Optimum as Optimum
+from .policies.energy_shaping import EnergyShaping as EnergyShaping
 from .policies.path_integral import PathIntegral as PathIntegral
-from .policies.rollout import EnergyShaping as EnergyShaping
 from .policies.rollout import RolloutPolicy as RolloutPolicy
 from .problem.bounded_input_cost import BoundedInputCost as BoundedInputCost
 from .problem.cost import Cost as Cost

@@ -26,16 +26,26 @@ from .graph import NARROW, REAL, WIDE
 from .loops import repeat, tracer_of
 from .tracer import LARGE, Tracer
 
+_WRITTEN = 12  # rows at most of matrices in batches whose factors are written out
+
 
 def in_memory(matrix: Tensor) -> bool:
     """Return whether a matrix stays in memory."""
     return matrix.shape[-1] * matrix.shape[-2] > LARGE
 
 
+def _is_long(matrix: Tensor) -> bool:
+    """Return whether a factorisation of a batch is a loop: written out, it takes a compiler too long."""
+    return in_memory(matrix) and matrix.shape[-1] > _WRITTEN
+
+
 def cholesky(gram: Tensor, *, upper: bool = False, check_errors: bool = False) -> tuple[Tensor, Tensor]:
     """L with L L' = K, and 0 or, where a pivot is not positive, its place: (...)."""
     where = _of_one(gram) if in_memory(gram) else None
-    factor, failed = _cholesky_by_columns(gram) if where is None else _cholesky_in_place(gram, *where)
+    if where is not None:
+        factor, failed = _cholesky_in_place(gram, *where)
+    else:
+        factor, failed = (_rolled_cholesky if _is_long(gram) else _cholesky_by_columns)(gram)
     return factor.mT.clone() if upper else factor, failed.to(torch.int32)
 
 
@@ -66,11 +76,15 @@ def triangular(
     """T^-1 B: (..., M, M), (..., M, P); B T^-1 where not ``left``."""
     if not left:
         return triangular(matrix.mT, right.mT, upper=not upper, unitriangular=unitriangular).mT.clone()
-    if in_memory(matrix) and (where := _of_one(matrix, right)) is not None:
-        if not upper:
-            return _triangular_in_place(matrix, right, unitriangular, *where)
-        flipped = matrix.flip(-1, -2), right.flip(-2)  # an upper triangle from behind is a lower one
-        return _triangular_in_place(*flipped, unitriangular, *where).flip(-2)
+    where = _of_one(matrix, right) if in_memory(matrix) else None
+    if where is not None or _is_long(matrix):
+        if upper:  # an upper triangle from behind is a lower one
+            matrix, right = matrix.flip(-1, -2), right.flip(-2)
+        if where is not None:
+            solution = _triangular_in_place(matrix, right, unitriangular, *where)
+        else:
+            solution = _rolled_triangular(matrix, right, unitriangular)
+        return solution.flip(-2) if upper else solution
     size = matrix.shape[-1]
     found: dict[int, Tensor] = {}
     for i in reversed(range(size)) if upper else range(size):
@@ -248,6 +262,48 @@ def log_determinant(matrix: Tensor) -> tuple[Tensor, Tensor]:
 def log_of_determinant(matrix: Tensor) -> Tensor:
     sign, size = log_determinant(matrix)
     return torch.where(sign < 0, torch.nan, size)
+
+
+def _rolled_cholesky(gram: Tensor) -> tuple[Tensor, Tensor]:
+    size = gram.shape[-1]
+    place = torch.arange(size, dtype=gram.dtype, device=gram.device)
+    zero = torch.zeros_like(gram[..., 0])
+
+    def eliminate(carry: tuple[Tensor, Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        rest, factor, done, failed = carry  # row i is row done + i, cyclically
+        pivot = rest[..., 0, 0]
+        failed = torch.where((failed == 0) & ~(pivot > 0), done + 1, failed)
+        open_ = place < size - done.unsqueeze(-1)
+        column = torch.where(open_, rest[..., 0] / pivot.sqrt().unsqueeze(-1), 0.0)
+        rest = rest - column.unsqueeze(-1) * column.unsqueeze(-2)
+        rest = torch.constant_pad_nd(rest[..., 1:, 1:], [0, 1, 0, 1])
+        factor = torch.cat((factor[..., 1:], column.unsqueeze(-1)), dim=-1)
+        return rest, torch.cat((factor[..., 1:, :], factor[..., :1, :]), dim=-2), done + 1, failed
+
+    start = gram.clone(), torch.zeros_like(gram), zero[..., 0], zero[..., 0].clone()
+    _, factor, _, failed = repeat(size, eliminate, start)
+    return factor, failed
+
+
+def _rolled_triangular(lower: Tensor, right: Tensor, unit: bool) -> Tensor:
+    size = lower.shape[-1]
+    place = torch.arange(size, dtype=lower.dtype, device=lower.device)
+    done = torch.zeros_like((lower[..., 0, :1] + right[..., 0, :1])[..., 0])
+    batch = done.shape
+
+    def substitute(carry: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        matrix, rows, done = carry  # row i is row done + i, cyclically
+        found = rows[..., :1, :]
+        found = found if unit else found / matrix[..., :1, :1]
+        open_ = (place < size - done.unsqueeze(-1)).unsqueeze(-1)
+        rows = torch.where(open_, rows - matrix[..., :1] * found, rows)
+        matrix = torch.cat((matrix[..., 1:, :], matrix[..., :1, :]), dim=-2)
+        matrix = torch.cat((matrix[..., 1:], matrix[..., :1]), dim=-1)
+        return matrix, torch.cat((rows[..., 1:, :], found), dim=-2), done + 1
+
+    start = lower.expand(*batch, size, size).clone(), right.expand(*batch, *right.shape[-2:]).clone(), done
+    solution: Tensor = repeat(size, substitute, start)[1]
+    return solution
 
 
 def _rolled_orthogonal(matrix: Tensor) -> tuple[Tensor, Tensor]:
