@@ -20,7 +20,7 @@ import staf_torch as st
 from staf_torch import adp, optim, predictors, systems, theory
 from staf_torch.adp.planning.shooting.starts import guesses
 from staf_torch.experiments import avoidance
-from staf_torch.experiments.rival_methods import CASES
+from staf_torch.experiments.rival_plants import CASES
 
 
 @contextmanager

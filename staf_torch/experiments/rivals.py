@@ -22,7 +22,8 @@ from ..settings.chase import plain, seed_of
 from ..signs import SHOWN, Progress
 from ..tables.model import significant
 from .registry import Metrics
-from .rival_methods import CASES, METHODS, Begin, Rival, RivalPlant, UnsuitableError, ipopt_program
+from .rival_methods import METHODS, Begin, Rival, UnsuitableError, ipopt_program
+from .rival_plants import CASES, RivalPlant
 from .study import Study, label_key, tell_of_cpu
 
 _log = logging.getLogger(__name__)

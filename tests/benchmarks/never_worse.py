@@ -13,7 +13,7 @@ import sys
 import torch
 
 from staf_torch import adp, systems
-from staf_torch.experiments.rival_methods import CASES
+from staf_torch.experiments.rival_plants import CASES
 
 _WORSE = 1.01
 # plant, cost weights (Q, R), bound, period in s, half the width of the box

@@ -2,7 +2,7 @@
 
     python tests/benchmarks/shooting.py [--cases CASE,CASE] [--states 4] [--starts 6] [--seed 0]
 
-Needs casadi. Every plant on which `experiments/rival_methods.py` compares methods, in continuous time, from
+Needs casadi. Every plant on which `experiments/rival_plants.py` compares methods, in continuous time, from
 random states of its box, and swing-ups from hanging and from random states; the mesh, the Runge-Kutta
 steps, the controls (linear on an interval) and the terminal cost are those that `DirectShooting` chose.
 IPOPT starts at its plan, at that plan shaken, and from controls that jump between the bounds around the
@@ -27,7 +27,7 @@ import torch
 from torch import Tensor
 
 from staf_torch import adp
-from staf_torch.experiments.rival_methods import CASES, RivalPlant
+from staf_torch.experiments.rival_plants import CASES, RivalPlant
 
 _SAME = 1e-4  # relative
 Row = dict[str, Any]

@@ -15,15 +15,13 @@ from torch import Tensor
 
 from staf_torch.experiments import rival_methods, rivals
 from staf_torch.experiments.rival_methods import (
-    CASES,
     METHODS,
     Begin,
     Rival,
-    RivalPlant,
-    TorchMath,
     UnsuitableError,
     ipopt_program,
 )
+from staf_torch.experiments.rival_plants import CASES, RivalPlant, TorchMath
 
 SHORT = dataclasses.replace(CASES["double_integrator"], steps=60, horizon=20)
 

@@ -14,12 +14,11 @@ from hypothesis import given, settings
 from torch import Tensor
 
 from staf_torch import lanes
+from staf_torch.lanes.trace.eigenvalues import eigen, eigenvalues
 from staf_torch.lanes.trace.factorisations import (
     cholesky,
     cholesky_solve,
     determinant,
-    eigen,
-    eigenvalues,
     inverse,
     log_determinant,
     orthogonal,

@@ -19,7 +19,8 @@ from torch.overrides import TorchFunctionMode
 from ..calls.inputs import Given, uncast
 from ..row_numbers import RowNumbers, made_of_list, resolving
 from ..tree import Shared, Tree, flatten, plain
-from . import factorisations
+from . import eigenvalues, factorisations
+from . import reductions as reductions  # its rules
 from .captured_tensors import Recipe, tensors
 from .decompositions import MOVEMENTS, REPLACEMENTS, choice, moved, of_torch
 from .graph import NOW, STEP, Graph, Sizes
@@ -215,7 +216,7 @@ class _TorchFunctions(TorchFunctionMode):
         kwargs, plain, name = kwargs or {}, _PLAIN.get(func), getattr(func, "__name__", "")
         if plain is not None and args and isinstance(args[0], Tensor):
             wrapped = torch._C._functorch.is_functorch_wrapped_tensor(args[0])
-            if plain is factorisations.eigenvalues:  # a bisection has no derivative worth the name
+            if plain is eigenvalues.eigenvalues:  # a bisection has no derivative worth the name
                 chosen = not wrapped and len(args) == 1 and not kwargs and self._traced(args[0])
             else:
                 chosen = wrapped or self._traced(args[0])
@@ -243,7 +244,7 @@ def _outside_transforms() -> Any:
 
 _LEAVES_TORCH = ("numpy", "__array__", "tolist", "__dlpack__", "__repr__")
 _PLAIN: dict[Any, Callable[..., Any]] = {
-    torch.linalg.eigvalsh: factorisations.eigenvalues,
+    torch.linalg.eigvalsh: eigenvalues.eigenvalues,
     torch.nn.functional.one_hot: _one_hot,
     **dict.fromkeys((torch.isfinite, Tensor.isfinite), _is_finite),
     **dict.fromkeys((torch.linalg.det, torch.det, Tensor.det), factorisations.determinant),
@@ -259,5 +260,5 @@ FACTORISATIONS: dict[str, Callable[..., Any]] = {
     "_linalg_solve_ex": factorisations.solve,
     "linalg_lu_solve": factorisations.solve_again,
     "linalg_qr": factorisations.orthogonal,
-    "_linalg_eigh": factorisations.eigen,
+    "_linalg_eigh": eigenvalues.eigen,
 }
