@@ -368,10 +368,24 @@ _MATH = """acos acosh asin asinh atan atan2 atanh cbrt ceil copysign cos cosh er
     logb lrint lround modf nan nearbyint nextafter nexttoward pow remainder remquo rint round scalbln
     scalbn sin sinh sqrt tan tanh tgamma trunc j0 j1 jn y0 y1 yn gamma drem finite significand exp10
     pow10 sincos scalb"""
-_MACROS = """NAN INFINITY HUGE_VAL NULL EOF I complex imaginary assert errno noreturn stdin stdout stderr
-    signbit isfinite isinf isnan isnormal fpclassify M_E M_PI M_PI_2 M_PI_4 M_SQRT2"""
-_LIBRARY = """main abs labs div exit abort calloc clock free malloc memcpy memset printf puts raise rand
-    realloc remove rename scanf signal size_t sprintf srand strlen system time"""
+_MACROS = """signbit isfinite isinf isnan isnormal fpclassify isgreater isgreaterequal isless islessequal
+    islessgreater isunordered signgam NAN INFINITY HUGE_VAL HUGE_VALF HUGE_VALL MATH_ERRNO MATH_ERREXCEPT
+    math_errhandling FP_NAN FP_INFINITE FP_ZERO FP_SUBNORMAL FP_NORMAL FP_FAST_FMA FP_ILOGB0 FP_ILOGBNAN
+    M_E M_LOG2E M_LOG10E M_LN2 M_LN10 M_PI M_PI_2 M_PI_4 M_1_PI M_2_PI M_2_SQRTPI M_SQRT2 M_SQRT1_2 NULL
+    EOF BUFSIZ RAND_MAX EXIT_SUCCESS EXIT_FAILURE CHAR_BIT INT_MAX INT_MIN DBL_MAX DBL_MIN DBL_EPSILON
+    FLT_MAX FLT_MIN FLT_EPSILON assert errno offsetof complex imaginary I stdin stdout stderr noreturn
+    setjmp va_list va_start va_arg va_end va_copy"""
+_LIBRARY = """main abort abs aligned_alloc asctime atexit atof atoi atol atoll bsearch calloc clearerr
+    clock ctime difftime div exit fclose feof ferror fflush fgetc fgetpos fgets fopen fprintf fputc fputs
+    fread free freopen fscanf fseek fsetpos ftell fwrite getc getchar getenv gets gmtime isalnum isalpha
+    isblank iscntrl isdigit isgraph islower isprint ispunct isspace isupper isxdigit labs ldiv llabs
+    lldiv localeconv localtime longjmp malloc mblen mbtowc memchr memcmp memcpy memmove memset mktime
+    perror printf putc putchar puts qsort quick_exit raise rand realloc remove rename rewind scanf setbuf
+    setlocale setvbuf signal snprintf sprintf srand sscanf strcat strchr strcmp strcoll strcpy strcspn
+    strerror strftime strlen strncat strncmp strncpy strpbrk strrchr strspn strstr strtod strtof strtok
+    strtol strtoul strxfrm system time time_t clock_t size_t ptrdiff_t tmpfile tmpnam tolower toupper
+    ungetc vfprintf vprintf vsprintf wcstombs wctomb int8_t int16_t int32_t int64_t uint8_t uint16_t
+    uint32_t uint64_t intptr_t uintptr_t float_t double_t"""
 _WORDS = {**dict.fromkeys(_CPP.split(), "a word of C++"), **dict.fromkeys(_C.split(), "a word of C")}
 _WORDS |= dict.fromkeys(_MACROS.split(), "a name of the C library")
 _FUNCTIONS = {name + end: "a function of math.h" for name in _MATH.split() for end in ("", "f", "l")}
