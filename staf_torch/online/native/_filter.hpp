@@ -106,8 +106,12 @@ INLINE Piece exponential_of(Piece x) {
     return x < -708. ? Piece{} : x != x ? x : found;
 }
 INLINE V exponential(V x) {
+#if PIECE == 8 * LANES
+    return exponential_of(x);
+#else
     for (int p = 0; p < pieces; ++p) piece(&x, p) = exponential_of(piece(&x, p));
     return x;
+#endif
 }
 
 #ifdef OWN
